@@ -1,0 +1,177 @@
+//! Putative correspondences, and which of them are still alive.
+
+use nalgebra::Point3;
+
+use crate::error::{Argument, Error};
+use crate::kernels::columns::Columns;
+use crate::scene::{PreparedCloud, Scene, check_points};
+
+/// Correspondences as a user hands them in: nothing is checked until a [`crate::Registrar`] takes them.
+///
+/// The row of a correspondence is its id, for the whole run and in the result.
+#[derive(Debug, Clone)]
+pub struct Correspondences {
+    pairs: Pairs,
+    similarity: Option<Vec<f64>>,
+}
+
+#[derive(Debug, Clone)]
+enum Pairs {
+    Rows(Vec<[usize; 2]>),
+    Points(Vec<[Point3<f64>; 2]>),
+}
+
+impl Correspondences {
+    /// Pairs of [source row, target row].
+    #[must_use]
+    pub fn from_rows(rows: Vec<[usize; 2]>) -> Self {
+        Self { pairs: Pairs::Rows(rows), similarity: None }
+    }
+
+    /// Pairs of [source point, target point], which need not be points of the clouds.
+    #[must_use]
+    pub fn from_points(points: Vec<[Point3<f64>; 2]>) -> Self {
+        Self { pairs: Pairs::Points(points), similarity: None }
+    }
+
+    /// How alike the two descriptors of each correspondence are; larger is better.
+    #[must_use]
+    pub fn with_similarity(mut self, similarity: Vec<f64>) -> Self {
+        self.similarity = Some(similarity);
+        self
+    }
+
+    /// M, the number of correspondences.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        match &self.pairs {
+            Pairs::Rows(rows) => rows.len(),
+            Pairs::Points(points) => points.len(),
+        }
+    }
+
+    /// Whether M is 0.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// Correspondences that were checked and looked up: M pairs of points; the row is the id.
+#[derive(Debug)]
+pub struct PointPairs {
+    /// p_i, in data units.
+    pub source: Vec<Point3<f64>>,
+    /// q_i, in data units.
+    pub target: Vec<Point3<f64>>,
+    /// The same pairs as centred `f32` columns in multiples of the resolution.
+    pub columns: Columns,
+    /// How alike the two descriptors of each pair are; larger is better.
+    pub similarity: Option<Vec<f64>>,
+}
+
+impl PointPairs {
+    pub(crate) fn new(given: &Correspondences, scene: &Scene<'_>) -> Result<Self, Error> {
+        let len = given.len();
+        if len > u32::MAX as usize {
+            return Err(Error::TooMany { argument: Argument::Corr, len });
+        }
+        if let Some(similarity) = &given.similarity {
+            check_similarity(similarity, len)?;
+        }
+        let (source, target): (Vec<_>, Vec<_>) = match &given.pairs {
+            Pairs::Rows(rows) => {
+                (look_up(rows, 0, scene.source)?, look_up(rows, 1, &scene.target)?)
+            }
+            Pairs::Points(points) => points.iter().map(|&[p, q]| (p, q)).unzip(),
+        };
+        check_points(&source, Argument::Corr)?;
+        check_points(&target, Argument::Corr)?;
+        let columns = Columns::new(&source, &target, scene.resolution);
+        Ok(Self { source, target, columns, similarity: given.similarity.clone() })
+    }
+
+    /// M, the number of correspondences.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.source.len()
+    }
+
+    /// Whether M is 0.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.source.is_empty()
+    }
+
+    /// (p_i, q_i) for each id.
+    pub fn pairs<'a>(
+        &'a self,
+        ids: impl IntoIterator<Item = u32, IntoIter: Clone> + 'a,
+    ) -> impl Iterator<Item = (&'a Point3<f64>, &'a Point3<f64>)> + Clone {
+        ids.into_iter().map(|i| (&self.source[i as usize], &self.target[i as usize]))
+    }
+}
+
+fn look_up(rows: &[[usize; 2]], column: usize, cloud: &PreparedCloud<'_>) -> Result<Vec<Point3<f64>>, Error> {
+    let points = &cloud.points;
+    let find = |(row, pair): (usize, &[usize; 2])| {
+        let index = pair[column];
+        points.get(index).copied().ok_or(Error::IndexOutOfRange {
+            row,
+            column,
+            index: index.cast_signed() as i64, // negative where a caller wrapped a negative index
+            len: points.len(),
+        })
+    };
+    rows.iter().enumerate().map(find).collect()
+}
+
+fn check_similarity(similarity: &[f64], expected: usize) -> Result<(), Error> {
+    if similarity.len() != expected {
+        return Err(Error::LengthMismatch {
+            argument: Argument::Similarity,
+            len: similarity.len(),
+            of: Argument::Corr,
+            expected,
+        });
+    }
+    match similarity.iter().position(|s| !s.is_finite()) {
+        Some(row) => Err(Error::Similarity { row, value: similarity[row] }),
+        None => Ok(()),
+    }
+}
+
+/// The correspondences that no round has removed yet.
+#[derive(Debug)]
+pub struct Alive {
+    ids: Vec<u32>,
+    columns: Columns,
+}
+
+impl Alive {
+    pub(crate) fn all(pairs: &PointPairs) -> Self {
+        Self { ids: (0..pairs.len() as u32).collect(), columns: pairs.columns.clone() }
+    }
+
+    /// Their ids, ascending.
+    #[must_use]
+    pub fn ids(&self) -> &[u32] {
+        &self.ids
+    }
+
+    /// Their points, row by row as in [`Self::ids`]; compacted so that kernels run over nothing else.
+    #[must_use]
+    pub fn columns(&self) -> &Columns {
+        &self.columns
+    }
+
+    /// Takes `ids` out; returns how many of them were alive.
+    pub(crate) fn remove(&mut self, ids: &[u32], pairs: &PointPairs) -> usize {
+        let mut gone = ids.to_vec();
+        gone.sort_unstable();
+        let before = self.ids.len();
+        self.ids.retain(|id| gone.binary_search(id).is_err());
+        self.columns = pairs.columns.gather(&self.ids);
+        before - self.ids.len()
+    }
+}

@@ -1,0 +1,16 @@
+//! The mathematics of the method, free of stages: pure functions, each with a naive twin in the tests.
+//!
+//! Public so that a stage of your own can be built from the same parts. Kernels trust their input (it was
+//! checked at the door, see [`crate::Registrar::begin`]) and give the same bits for any number of threads.
+
+pub mod columns;
+pub mod compatibility;
+pub mod kabsch;
+pub mod mae;
+pub mod neighbors;
+pub mod otsu;
+pub mod overlap;
+pub mod par;
+pub mod replicator;
+pub mod rng;
+pub mod triplets;

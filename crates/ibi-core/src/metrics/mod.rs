@@ -1,0 +1,90 @@
+//! How good a set of predicted poses is: pose errors, one-to-one assignment, and the scores of the field.
+//!
+//! Two families of scores are in use and their numbers cannot be compared, so each result carries its
+//! [`Matching`] and [`mean_score`] refuses to mix them:
+//!
+//! | | [`Matching::OneToOne`] | [`Matching::Any`] |
+//! |---|---|---|
+//! | used by | ECC, IBI | `PointCLM`, MIRETR, 3DFMNet |
+//! | pairs | one optimal assignment, *before* any threshold | every prediction with every truth |
+//! | duplicates | false positives | free |
+//! | MHF1 | mean of the scenes' F1 | harmonic mean of MHR and MHP |
+//!
+//! A pose is an [`Isometry3`](nalgebra::Isometry3) and reads `target_from_source`: it moves the model into
+//! the scene. Poses and points are finite by contract; nothing here looks for NaN again.
+//!
+//! # Examples
+//!
+//! ```
+//! use ibi_core::metrics::{Criterion, Matching, PoseThresholds, score_scene};
+//! use nalgebra::Isometry3;
+//!
+//! let truth = [Isometry3::translation(0.0, 0.0, 0.0), Isometry3::translation(5.0, 0.0, 0.0)];
+//! let predicted = [Isometry3::translation(0.1, 0.0, 0.0), Isometry3::translation(0.2, 0.0, 0.0)];
+//! let ecc = Criterion::Pose(PoseThresholds::ecc());
+//!
+//! // The second prediction repeats the first: a false positive here ...
+//! let strict = score_scene(&predicted, &truth, Matching::OneToOne, &ecc);
+//! assert_eq!((strict.recall, strict.precision), (0.5, 0.5));
+//! // ... and free here.
+//! let lenient = score_scene(&predicted, &truth, Matching::Any, &ecc);
+//! assert_eq!((lenient.recall, lenient.precision), (0.5, 1.0));
+//! ```
+
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::float_cmp, reason = "tests may panic, and compare what is exact")
+)]
+
+mod assignment;
+mod criterion;
+mod diameter;
+#[cfg(test)]
+mod laws;
+mod mean_score;
+mod model;
+mod mssd_recall;
+mod pose_error;
+mod scene_score;
+#[cfg(test)]
+mod strategies;
+
+pub use assignment::assignment;
+pub use criterion::{ADD_S_DIAMETER_FRACTION, Criterion, Matching, PoseThresholds};
+pub use diameter::diameter;
+pub use mean_score::{MeanScore, mean_score};
+pub use model::Model;
+pub use mssd_recall::{MSSD_DIAMETER_FRACTIONS, MssdRecall, mssd_recall};
+pub use pose_error::{frobenius_distance, rotation_error_rad, translation_error};
+pub use scene_score::{PoseMatch, SceneScore, score_scene};
+
+/// Why a metric has no value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum MetricsError {
+    /// A model needs at least one point: a mean or a maximum over none has no value.
+    #[error("the model has no points")]
+    EmptyModel,
+    /// A model point is NaN or infinite.
+    #[error("model point {index} is not finite")]
+    NonFinitePoint {
+        /// Row of the first such point.
+        index: usize,
+    },
+    /// A mean over no scenes has no value.
+    #[error("no scenes to average")]
+    NoScenes,
+    /// Scores of the two families have no common mean.
+    #[error("scene {index} is scored with {found}, the scenes before it with {expected}")]
+    MixedMatching {
+        /// Row of the first scene that differs from scene 0.
+        index: usize,
+        /// The matching of scene 0.
+        expected: Matching,
+        /// The matching of scene `index`.
+        found: Matching,
+    },
+    /// The hits do not fit the poses they are counted among, or, one to one, each other.
+    #[error("more hits than poses, or hits that do not come in pairs")]
+    ImpossibleCounts,
+}

@@ -1,0 +1,258 @@
+//! Errors between two poses of a model: ADD, ADD-S, MSSD.
+
+use super::{MetricsError, diameter};
+use crate::kernels::neighbors::Neighbors;
+use nalgebra::{Isometry3, Point3};
+use std::sync::OnceLock;
+
+/// The points of a model, with what its errors need: a kd-tree and the diameter, each made on first use.
+///
+/// All errors are in the unit of the data. A dense model may be subsampled first: they are means and maxima
+/// over the surface, at a cost per point.
+///
+/// # Examples
+///
+/// ```
+/// use ibi_core::metrics::Model;
+/// use nalgebra::{Isometry3, Point3, Vector3};
+/// use std::f64::consts::PI;
+///
+/// let stick = Model::new(vec![Point3::new(-1.0, 0.0, 0.0), Point3::new(1.0, 0.0, 0.0)])?;
+/// let (truth, flipped) = (Isometry3::identity(), Isometry3::rotation(Vector3::z() * PI));
+/// assert_eq!(stick.diameter(), 2.0);
+/// // Each end is 2 from where it belongs, but on the other end: the stick looks right.
+/// assert!((stick.add(&flipped, &truth) - 2.0).abs() < 1e-12);
+/// assert!(stick.add_s(&flipped, &truth) < 1e-12);
+/// assert!(stick.mssd(&flipped, &truth, &[flipped]) < 1e-12);
+/// # Ok::<(), ibi_core::metrics::MetricsError>(())
+/// ```
+#[derive(Debug)]
+pub struct Model {
+    points: Vec<Point3<f64>>,
+    tree: OnceLock<Neighbors>,
+    diameter: OnceLock<f64>,
+}
+
+impl Model {
+    /// A model of these points, in its own frame.
+    ///
+    /// # Errors
+    ///
+    /// [`MetricsError::EmptyModel`] without points, [`MetricsError::NonFinitePoint`] if a point is not finite.
+    pub fn new(points: Vec<Point3<f64>>) -> Result<Self, MetricsError> {
+        if points.is_empty() {
+            return Err(MetricsError::EmptyModel);
+        }
+        if let Some(index) = points.iter().position(|p| !p.iter().all(|x| x.is_finite())) {
+            return Err(MetricsError::NonFinitePoint { index });
+        }
+        Ok(Self { points, tree: OnceLock::new(), diameter: OnceLock::new() })
+    }
+
+    /// The points, as given.
+    #[must_use]
+    pub fn points(&self) -> &[Point3<f64>] {
+        &self.points
+    }
+
+    /// The largest distance between two points, see [`diameter()`].
+    #[must_use]
+    pub fn diameter(&self) -> f64 {
+        *self.diameter.get_or_init(|| diameter(&self.points))
+    }
+
+    /// ADD: the mean distance between each model point under one pose and the same point under the other.
+    ///
+    /// Hinterstoisser et al., "Model based training, detection and pose estimation of texture-less 3D objects
+    /// in heavily cluttered scenes", ACCV 2012.
+    ///
+    /// # Complexity
+    ///
+    /// O(n) in the number of points.
+    #[must_use]
+    pub fn add(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>) -> f64 {
+        // A common motion changes no distance, so one motion does in place of two.
+        let difference = predicted.inverse() * truth;
+        self.mean(|p| (difference * p - p).norm())
+    }
+
+    /// ADD-S: the mean distance between each model point under the truth and the model point *closest* to it
+    /// under the prediction. Blind to symmetry, whether exact or only nearly so, with none declared.
+    ///
+    /// Not symmetric: exchanging the two poses changes the value, though little when it is small.
+    ///
+    /// From the same paper; named ADD-S by Xiang et al., "`PoseCNN`: A convolutional neural network for 6D object
+    /// pose estimation in cluttered scenes", RSS 2018.
+    ///
+    /// # Complexity
+    ///
+    /// n queries of a kd-tree of n points.
+    #[must_use]
+    pub fn add_s(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>) -> f64 {
+        let tree = self.tree.get_or_init(|| Neighbors::new(&self.points));
+        // Asked in the model's frame, where one tree serves every pose.
+        let difference = predicted.inverse() * truth;
+        self.mean(|p| tree.nearest(&(difference * p)).map_or(0.0, |(_, dist_sq)| dist_sq.sqrt()))
+    }
+
+    /// MSSD: the largest distance between a model point under the prediction and the same point under the
+    /// truth, for the symmetry of the model under which this is least.
+    ///
+    /// `symmetries` are motions of the model, in its frame, that leave it looking the same. The identity is
+    /// always among them and need not be named; give an empty slice for a model without symmetry.
+    ///
+    /// Hodan et al., "BOP challenge 2020 on 6D object localization", ECCV workshops 2020.
+    ///
+    /// # Complexity
+    ///
+    /// O(n s) at worst for n points and s symmetries; a symmetry is left at the first point worse than the
+    /// best symmetry before it.
+    #[must_use]
+    pub fn mssd(
+        &self,
+        predicted: &Isometry3<f64>,
+        truth: &Isometry3<f64>,
+        symmetries: &[Isometry3<f64>],
+    ) -> f64 {
+        let difference = predicted.inverse() * truth;
+        let mut least_sq = self.max_dist_sq(&difference, f64::INFINITY);
+        for symmetry in symmetries {
+            least_sq = least_sq.min(self.max_dist_sq(&(difference * symmetry), least_sq));
+        }
+        least_sq.sqrt()
+    }
+
+    /// The largest squared distance a point moves by; any number above `enough` once it is above that.
+    fn max_dist_sq(&self, motion: &Isometry3<f64>, enough: f64) -> f64 {
+        let mut max_sq = 0.0_f64;
+        for p in &self.points {
+            max_sq = max_sq.max((motion * p - p).norm_squared());
+            if max_sq > enough {
+                break;
+            }
+        }
+        max_sq
+    }
+
+    fn mean(&self, error: impl Fn(&Point3<f64>) -> f64) -> f64 {
+        self.points.iter().map(error).sum::<f64>() / self.points.len() as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::strategies::{isometries, points};
+    use super::*;
+    use nalgebra::Vector3;
+    use proptest::prelude::*;
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    fn models() -> impl Strategy<Value = Model> {
+        points(1..30).prop_map(|points| Model::new(points).unwrap())
+    }
+
+    /// The naive twin of ADD-S, word for word after the formula.
+    fn naive_add_s(model: &Model, predicted: &Isometry3<f64>, truth: &Isometry3<f64>) -> f64 {
+        let closest = |p: &Point3<f64>| {
+            model.points().iter().map(|q| (truth * p - predicted * q).norm()).fold(f64::INFINITY, f64::min)
+        };
+        model.points().iter().map(closest).sum::<f64>() / model.points().len() as f64
+    }
+
+    /// The naive twin of MSSD.
+    fn naive_mssd(
+        model: &Model,
+        predicted: &Isometry3<f64>,
+        truth: &Isometry3<f64>,
+        symmetries: &[Isometry3<f64>],
+    ) -> f64 {
+        let identity = Isometry3::identity();
+        let worst = |s: &Isometry3<f64>| {
+            model.points().iter().map(|p| (predicted * p - truth * (s * p)).norm()).fold(0.0, f64::max)
+        };
+        symmetries.iter().chain([&identity]).map(worst).fold(f64::INFINITY, f64::min)
+    }
+
+    proptest! {
+        #[test]
+        fn agree_with_the_formulas(
+            model in models(),
+            a in isometries(),
+            b in isometries(),
+            symmetries in prop::collection::vec(isometries(), 0..4),
+        ) {
+            let add = model.points().iter().map(|p| (a * p - b * p).norm()).sum::<f64>();
+            prop_assert!((model.add(&a, &b) - add / model.points().len() as f64).abs() < 1e-9);
+            prop_assert!((model.add_s(&a, &b) - naive_add_s(&model, &a, &b)).abs() < 1e-9);
+            prop_assert!((model.mssd(&a, &b, &symmetries) - naive_mssd(&model, &a, &b, &symmetries)).abs() < 1e-9);
+        }
+
+        #[test]
+        fn in_their_order(model in models(), a in isometries(), b in isometries()) {
+            // The closest point is no farther than the same point, a mean no larger than a maximum.
+            let (add, add_s) = (model.add(&a, &b), model.add_s(&a, &b));
+            prop_assert!(add_s <= add + 1e-9);
+            prop_assert!(add <= model.mssd(&a, &b, &[]) + 1e-9);
+        }
+
+        // Moving the scene changes nothing; neither does giving the model in another frame.
+        #[test]
+        fn invariances(model in models(), a in isometries(), b in isometries(), motion in isometries()) {
+            let moved = Model::new(model.points().iter().map(|p| motion.inverse() * p).collect()).unwrap();
+            let left = (motion * a, motion * b);
+            let right = (a * motion, b * motion);
+            prop_assert!((model.add(&left.0, &left.1) - model.add(&a, &b)).abs() < 1e-9);
+            prop_assert!((model.add_s(&left.0, &left.1) - model.add_s(&a, &b)).abs() < 1e-9);
+            prop_assert!((model.mssd(&left.0, &left.1, &[]) - model.mssd(&a, &b, &[])).abs() < 1e-9);
+            prop_assert!((moved.add(&right.0, &right.1) - model.add(&a, &b)).abs() < 1e-9);
+            prop_assert!((moved.add_s(&right.0, &right.1) - model.add_s(&a, &b)).abs() < 1e-9);
+            prop_assert!((moved.mssd(&right.0, &right.1, &[]) - model.mssd(&a, &b, &[])).abs() < 1e-9);
+        }
+    }
+
+    /// The corners of a square of side 2 about the origin, in the plane z = 0.
+    fn square() -> Model {
+        let corners = [[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]];
+        Model::new(corners.map(Point3::from).to_vec()).unwrap()
+    }
+
+    #[test]
+    fn a_square_turned_by_a_quarter_looks_the_same() {
+        let quarter = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
+        let truth = Isometry3::translation(3.0, 1.0, 0.0);
+        let predicted = truth * quarter;
+        // Each corner moves along one side, 2; the corner it lands on is where the model has one.
+        assert!((square().add(&predicted, &truth) - 2.0).abs() < 1e-12);
+        assert!(square().add_s(&predicted, &truth) < 1e-12);
+        assert!((square().mssd(&predicted, &truth, &[]) - 2.0).abs() < 1e-12);
+        assert!(square().mssd(&predicted, &truth, &[quarter]) < 1e-12);
+    }
+
+    #[test]
+    fn half_a_turn_counts_to_the_far_corner_unless_a_quarter_is_allowed() {
+        // Half a turn moves a corner along the diagonal, 2 sqrt(2); a quarter turn of it back leaves a side, 2.
+        let predicted = Isometry3::rotation(Vector3::z() * PI);
+        let quarter = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
+        let truth = Isometry3::identity();
+        assert!((square().mssd(&predicted, &truth, &[]) - 8.0_f64.sqrt()).abs() < 1e-12);
+        assert!((square().mssd(&predicted, &truth, &[quarter]) - 2.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn add_s_asks_from_the_truth_to_the_prediction() {
+        // Points at x = 0, 1 and 10; the prediction is 9 too far right, so its points are at 9, 10 and 19.
+        // From the truth: 0 -> 9 is 9, 1 -> 9 is 8, 10 -> 10 is 0: 17 / 3.
+        // The other way round: 9 -> 10 is 1, 10 -> 10 is 0, 19 -> 10 is 9: 10 / 3.
+        let model = Model::new([0.0, 1.0, 10.0].map(|x| Point3::new(x, 0.0, 0.0)).to_vec()).unwrap();
+        let (truth, predicted) = (Isometry3::identity(), Isometry3::translation(9.0, 0.0, 0.0));
+        assert!((model.add_s(&predicted, &truth) - 17.0 / 3.0).abs() < 1e-12);
+        assert!((model.add_s(&truth, &predicted) - 10.0 / 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_model_needs_finite_points() {
+        assert_eq!(Model::new(vec![]).unwrap_err(), MetricsError::EmptyModel);
+        let points = vec![Point3::origin(), Point3::new(0.0, f64::NAN, 0.0)];
+        assert_eq!(Model::new(points).unwrap_err(), MetricsError::NonFinitePoint { index: 1 });
+    }
+}

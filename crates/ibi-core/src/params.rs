@@ -1,0 +1,146 @@
+//! Parameters: plain data, all defaulted, checked once when a [`crate::Registrar`] takes them.
+//!
+//! Every length ends in `_pr` and is a multiple of the resolution `pr`, the mean of the two clouds' mean
+//! nearest-neighbour distances, so that nothing depends on the unit of the data.
+
+use crate::error::Error;
+use crate::kernels::compatibility::Payoff;
+use crate::stages::ce::{Ce, Voting};
+use crate::stages::hv::{Hv, Overlap};
+use crate::stages::scs::{Gtm, Scs};
+use crate::stages::te::{Gsac, Te};
+
+/// How a registration runs. The default is [`Params::paper_synthetic`] with `t_he_pr` 3.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+pub struct Params {
+    /// Key of all random streams. The same seed gives the same bits, for any number of threads.
+    pub seed: u64,
+    /// pr in data units; `None` estimates it from the clouds. > 0.
+    pub resolution: Option<f64>,
+    /// `delta_r` of Eq. 5: how fast payoff and votes fall with the rigidity, in pr. > 0.
+    pub delta_r_pr: f64,
+    /// `t_he` of Eq. 8: largest residual of an inlier, in pr. > 0.
+    pub t_he_pr: f64,
+    /// `d_op`: largest distance of overlapping points, in pr. > 0.
+    pub d_op_pr: f64,
+    /// `t_s`: a run ends when fewer seeds than this are found. At least 3.
+    pub t_s: u32,
+    /// Seed correspondence selection.
+    pub scs: Scs,
+    /// Correspondence enhancement.
+    pub ce: Ce,
+    /// Transformation estimation.
+    pub te: Te,
+    /// Hypothesis validation.
+    pub hv: Hv,
+    /// Which correspondences a round removes.
+    pub removal: Removal,
+    /// A run ends after this many rounds; `None`: no limit.
+    pub max_rounds: Option<u32>,
+    /// A run ends with this many instances; `None`: no limit.
+    pub max_instances: Option<u32>,
+    /// A run ends after this many seconds and keeps what it has; `None`: no limit. >= 0.
+    pub timeout_s: Option<f64>,
+}
+
+/// Which correspondences a round removes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
+#[non_exhaustive]
+pub enum Removal {
+    /// The dense correspondences `C_d` of the round, accepted or not.
+    // PAPER: the text removes C_d after a rejection too; its pseudocode does not, and can loop for ever.
+    #[default]
+    Dense,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { t_he_pr: 3.0, ..Self::paper_synthetic() }
+    }
+}
+
+impl Params {
+    /// The paper's setting for its synthetic data set.
+    #[must_use]
+    pub fn paper_synthetic() -> Self {
+        Self {
+            seed: 0,
+            resolution: None,
+            delta_r_pr: 10.0,
+            t_he_pr: 10.0,
+            d_op_pr: 1.5,
+            t_s: 5,
+            scs: Gtm { n_downsample: 1024, n_gtm: 20, payoff: Payoff::Gaussian }.into(),
+            ce: Voting { n_vot: 300 }.into(),
+            te: Gsac { n_gsac: 100, ..Gsac::default() }.into(),
+            hv: Overlap { t_overlap: 0.85 }.into(),
+            removal: Removal::Dense,
+            max_rounds: None,
+            max_instances: None,
+            timeout_s: None,
+        }
+    }
+
+    /// The paper's setting for its real data set.
+    #[must_use]
+    pub fn paper_real() -> Self {
+        Self {
+            t_he_pr: 1.0,
+            d_op_pr: 3.0,
+            te: Gsac { n_gsac: 20, ..Gsac::default() }.into(),
+            hv: Overlap { t_overlap: 0.7 }.into(),
+            ..Self::paper_synthetic()
+        }
+    }
+
+    /// Checks every parameter against its range.
+    ///
+    /// # Errors
+    /// [`Error::Param`] for the first one out of range.
+    pub fn validate(&self) -> Result<(), Error> {
+        positive("resolution", self.resolution.unwrap_or(1.0))?;
+        positive("delta_r_pr", self.delta_r_pr)?;
+        positive("t_he_pr", self.t_he_pr)?;
+        positive("d_op_pr", self.d_op_pr)?;
+        at_least_3("t_s", self.t_s)?;
+        let timeout_s = self.timeout_s.unwrap_or(0.0);
+        check("timeout_s", timeout_s, (0.0..=1e9).contains(&timeout_s), "between 0 and 1e9 seconds")?;
+        self.scs.check()?;
+        self.ce.check()?;
+        self.te.check()?;
+        self.hv.check()
+    }
+}
+
+/// Lengths below or above this many data units, or pr, are mistakes, and their squares leave the floats.
+const LENGTHS: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
+
+fn check(name: &'static str, value: f64, fine: bool, allowed: &'static str) -> Result<(), Error> {
+    if fine { Ok(()) } else { Err(Error::Param { name, value, allowed }) }
+}
+
+pub(crate) fn positive(name: &'static str, value: f64) -> Result<(), Error> {
+    check(name, value, LENGTHS.contains(&value), "between 1e-9 and 1e9")
+}
+
+pub(crate) fn non_negative(name: &'static str, value: f64) -> Result<(), Error> {
+    check(name, value, value == 0.0 || LENGTHS.contains(&value), "0 or between 1e-9 and 1e9")
+}
+
+pub(crate) fn at_least_1(name: &'static str, value: u32) -> Result<(), Error> {
+    check(name, value.into(), value >= 1, "at least 1")
+}
+
+pub(crate) fn at_least_3(name: &'static str, value: u32) -> Result<(), Error> {
+    check(name, value.into(), value >= 3, "at least 3")
+}
+
+pub(crate) fn at_most(name: &'static str, value: u32, max: u32, allowed: &'static str) -> Result<(), Error> {
+    check(name, value.into(), value <= max, allowed)
+}
+
+pub(crate) fn share(name: &'static str, value: f64) -> Result<(), Error> {
+    check(name, value, (0.0..=1.0).contains(&value), "between 0 and 1")
+}

@@ -1,0 +1,271 @@
+//! The loop: `step` is one round in the paper's order, `run` repeats it.
+
+use std::ops::ControlFlow;
+use std::sync::Arc;
+use std::time::Instant;
+
+use crate::correspondence::{Alive, Correspondences, PointPairs};
+use crate::error::{Argument, Error};
+use crate::interrupt::{CancelToken, Interrupt};
+use crate::kernels::par::Pool;
+use crate::params::{Params, Removal};
+use crate::registration::{Registration, Round, StopReason};
+use crate::scene::{Cloud, PreparedCloud, Scene};
+use crate::stages::{Enhance, EstimatePose, SelectSeeds, Validate};
+use crate::state::{Problem, State};
+
+/// A prepared source, the parameters and the four stages; registers the source to any number of targets.
+///
+/// # Examples
+/// ```
+/// use ibi_core::{Cloud, Correspondences, Params, Registrar, stages::ce};
+///
+/// // A source of 60 points, and a target that holds it twice, 5 to the right and 5 to the left.
+/// let source: Vec<[f64; 3]> =
+///     (0..60).map(f64::from).map(|i| [(i * 0.7).sin(), (i * 1.3).cos(), (i * 2.9).sin()]).collect();
+/// let moved = |dx: f64| source.iter().map(move |[x, y, z]| [x + dx, *y, *z]);
+/// let target: Vec<[f64; 3]> = moved(5.0).chain(moved(-5.0)).collect();
+/// // All of the first instance is matched, and two thirds of the second.
+/// let rows = (0..100).map(|row| [row % 60, row]).collect();
+///
+/// // A round removes the n_vot best-voted correspondences, so they should be as many as one instance has.
+/// let params = Params { ce: ce::Voting { n_vot: 60 }.into(), ..Params::default() };
+/// let found = Registrar::new(&Cloud::from(source.clone()))?
+///     .params(params)
+///     .register(&Cloud::from(target), &Correspondences::from_rows(rows))?;
+///
+/// let mut x: Vec<f64> = found.poses.iter().map(|pose| pose.target_from_source.translation.x.round()).collect();
+/// x.sort_by(f64::total_cmp);
+/// assert_eq!(x, [-5.0, 5.0]);
+/// # Ok::<(), ibi_core::Error>(())
+/// ```
+pub struct Registrar<'a> {
+    source: PreparedCloud<'a>,
+    params: Params,
+    scs: Option<Box<dyn SelectSeeds>>,
+    ce: Option<Box<dyn Enhance>>,
+    te: Option<Box<dyn EstimatePose>>,
+    hv: Option<Box<dyn Validate>>,
+    num_threads: Option<usize>,
+    cancel: CancelToken,
+}
+
+impl<'a> Registrar<'a> {
+    /// Checks and prepares the source, with default parameters.
+    ///
+    /// # Errors
+    /// If the source has fewer than three points, or one that is not finite, or all at one place, or normals
+    /// that do not fit it.
+    pub fn new(source: &Cloud<'a>) -> Result<Self, Error> {
+        Ok(Self {
+            source: PreparedCloud::new(source, Argument::Src, Argument::SrcNormals)?,
+            params: Params::default(),
+            scs: None,
+            ce: None,
+            te: None,
+            hv: None,
+            num_threads: None,
+            cancel: CancelToken::default(),
+        })
+    }
+
+    /// Sets the parameters; they are checked when a run begins.
+    #[must_use]
+    pub fn params(mut self, params: Params) -> Self {
+        self.params = params;
+        self
+    }
+
+    /// Threads per run. Default: as many as the process may use. The result does not depend on it.
+    #[must_use]
+    pub fn num_threads(mut self, num_threads: usize) -> Self {
+        self.num_threads = Some(num_threads);
+        self
+    }
+
+    /// A token that cancels the runs from another thread.
+    #[must_use]
+    pub fn cancel_token(mut self, token: CancelToken) -> Self {
+        self.cancel = token;
+        self
+    }
+
+    /// Puts a seed selection of your own in the place of `params.scs`.
+    #[must_use]
+    pub fn with_scs(mut self, scs: impl SelectSeeds + 'static) -> Self {
+        self.scs = Some(Box::new(scs));
+        self
+    }
+
+    /// Puts an enhancement of your own in the place of `params.ce`.
+    #[must_use]
+    pub fn with_ce(mut self, ce: impl Enhance + 'static) -> Self {
+        self.ce = Some(Box::new(ce));
+        self
+    }
+
+    /// Puts an estimation of your own in the place of `params.te`.
+    #[must_use]
+    pub fn with_te(mut self, te: impl EstimatePose + 'static) -> Self {
+        self.te = Some(Box::new(te));
+        self
+    }
+
+    /// Puts a validation of your own in the place of `params.hv`.
+    #[must_use]
+    pub fn with_hv(mut self, hv: impl Validate + 'static) -> Self {
+        self.hv = Some(Box::new(hv));
+        self
+    }
+
+    /// Finds all instances of the source in `target`: [`Self::begin`], [`Self::run`], [`Self::finish`].
+    ///
+    /// # Errors
+    /// Those of [`Self::begin`]. Finding nothing is no error: see [`Registration::stop_reason`].
+    pub fn register(
+        &self,
+        target: &Cloud<'_>,
+        correspondences: &Correspondences,
+    ) -> Result<Registration, Error> {
+        self.register_observed(target, correspondences, &mut ())
+    }
+
+    /// [`Self::register`] with an observer that sees every round and may end the run.
+    ///
+    /// # Errors
+    /// Those of [`Self::begin`].
+    pub fn register_observed(
+        &self,
+        target: &Cloud<'_>,
+        correspondences: &Correspondences,
+        observer: &mut dyn Observer,
+    ) -> Result<Registration, Error> {
+        let mut state = self.begin(target, correspondences)?;
+        let stop_reason = self.run(&mut state, observer);
+        Ok(self.finish(state, stop_reason))
+    }
+
+    /// Checks parameters and input, builds what all rounds share.
+    ///
+    /// # Errors
+    /// If a parameter is out of range; if the target is as bad as a source may be (see [`Self::new`]); if a
+    /// correspondence points outside of a cloud; if only one cloud has normals; if the clouds cannot be in the
+    /// same unit; if the threads cannot be started.
+    pub fn begin<'s>(
+        &'s self,
+        target: &Cloud<'s>,
+        correspondences: &Correspondences,
+    ) -> Result<State<'s>, Error> {
+        let start = Instant::now();
+        self.params.validate()?;
+        let pool = Arc::new(Pool::new(self.num_threads)?);
+        let (scene, pairs) = pool.install(|| {
+            let target = PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals)?;
+            let scene = Scene::new(&self.source, target, self.params.resolution)?;
+            let pairs = PointPairs::new(correspondences, &scene)?;
+            Ok::<_, Error>((scene, pairs))
+        })?;
+        let interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
+        Ok(State::new(Problem { alive: Alive::all(&pairs), scene, pairs, interrupt }, pool, start))
+    }
+
+    /// Plays rounds until one of them ends the run, or the observer does.
+    pub fn run(&self, state: &mut State<'_>, observer: &mut dyn Observer) -> StopReason {
+        let pool = Arc::clone(&state.pool);
+        pool.install(|| {
+            loop {
+                match self.step(state) {
+                    ControlFlow::Break(reason) => return reason,
+                    ControlFlow::Continue(round) if observer.on_round(&round).is_break() => {
+                        return StopReason::Cancelled;
+                    }
+                    ControlFlow::Continue(_) => {}
+                }
+            }
+        })
+    }
+
+    /// Plays one round: SCS -> CE -> TE -> HV, then removal. Breaks with the reason if the run is over.
+    pub fn step(&self, state: &mut State<'_>) -> ControlFlow<StopReason, Round> {
+        let pool = Arc::clone(&state.pool);
+        pool.install(|| {
+            state.check_limits(&self.params)?;
+            let context = state.problem.context(&self.params, state.rounds.len());
+            let times = &mut state.timings;
+
+            let seeds = timed(&mut times.scs_s, || self.scs().select_seeds(&context));
+            state.problem.interrupt.check()?;
+            if seeds.len() < self.params.t_s as usize {
+                let (value, threshold) = (seeds.len() as u32, self.params.t_s);
+                return ControlFlow::Break(StopReason::FewSeeds { value, threshold });
+            }
+            let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
+            let estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
+            let verdict = estimate
+                .hypothesis
+                .map(|hypothesis| timed(&mut times.hv_s, || self.hv().validate(&context, &hypothesis)));
+            state.problem.interrupt.check()?;
+
+            let removed = match self.params.removal {
+                Removal::Dense => dense.ids(),
+            };
+            state.conclude(&seeds, &dense, &estimate, verdict, removed)
+        })
+    }
+
+    /// Turns what a run has found into its result.
+    #[must_use]
+    pub fn finish(&self, state: State<'_>, stop_reason: StopReason) -> Registration {
+        let pool = Arc::clone(&state.pool);
+        pool.install(|| state.into_registration(&self.params, stop_reason))
+    }
+
+    fn scs(&self) -> &dyn SelectSeeds {
+        self.scs.as_deref().unwrap_or(&self.params.scs)
+    }
+
+    fn ce(&self) -> &dyn Enhance {
+        self.ce.as_deref().unwrap_or(&self.params.ce)
+    }
+
+    fn te(&self) -> &dyn EstimatePose {
+        self.te.as_deref().unwrap_or(&self.params.te)
+    }
+
+    fn hv(&self) -> &dyn Validate {
+        self.hv.as_deref().unwrap_or(&self.params.hv)
+    }
+}
+
+impl std::fmt::Debug for Registrar<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Registrar").field("params", &self.params).finish_non_exhaustive()
+    }
+}
+
+/// Sees every round of a run; may end it. Any `FnMut(&Round) -> ControlFlow<()>` is one.
+pub trait Observer: Send {
+    /// Called after each round; `Break` ends the run, which keeps what it has found.
+    fn on_round(&mut self, round: &Round) -> ControlFlow<()>;
+}
+
+/// Watches nothing.
+impl Observer for () {
+    fn on_round(&mut self, _round: &Round) -> ControlFlow<()> {
+        ControlFlow::Continue(())
+    }
+}
+
+impl<F: FnMut(&Round) -> ControlFlow<()> + Send> Observer for F {
+    fn on_round(&mut self, round: &Round) -> ControlFlow<()> {
+        self(round)
+    }
+}
+
+/// Runs `job` and adds its seconds to `total_s`.
+fn timed<T>(total_s: &mut f64, job: impl FnOnce() -> T) -> T {
+    let start = Instant::now();
+    let result = job();
+    *total_s += start.elapsed().as_secs_f64();
+    result
+}

@@ -1,0 +1,162 @@
+//! What a run says about itself.
+
+use nalgebra::Isometry3;
+
+use crate::stages::Verdict;
+
+/// The instances found, and how the run came to them.
+#[derive(Debug, Clone)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[non_exhaustive]
+pub struct Registration {
+    /// The instances, best score first.
+    pub poses: Vec<Pose>,
+    /// For each correspondence the instance (index into `poses`) it fits best with a residual below `t_he`.
+    pub labels: Vec<Option<u32>>,
+    /// One entry per round that was played to its end.
+    pub rounds: Vec<Round>,
+    /// Why the run ended.
+    pub stop_reason: StopReason,
+    /// Where the time went.
+    pub timings: Timings,
+    /// pr, in data units.
+    pub resolution: f64,
+}
+
+/// One instance.
+#[derive(Debug, Clone)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[non_exhaustive]
+pub struct Pose {
+    /// Moves source points onto this instance; data units.
+    pub target_from_source: Isometry3<f64>,
+    /// What poses are ranked by, 0 to 1: the overlap.
+    pub score: f64,
+    /// Share of source points within `d_op` of a target point, 0 to 1.
+    pub overlap: f64,
+    /// Root mean square residual of the inliers, data units; 0 without inliers.
+    pub inlier_rmse: f64,
+    /// Ids of all correspondences with a residual below `t_he`, ascending. An id may be an inlier of several
+    /// poses.
+    pub inliers: Vec<u32>,
+    /// The round that found it.
+    pub round: u32,
+}
+
+/// One round: one pass through the four stages.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[non_exhaustive]
+pub struct Round {
+    /// Number of the round, from 0.
+    pub index: u32,
+    /// Correspondences alive at its start.
+    pub num_alive: u32,
+    /// `N_s`, seeds found.
+    pub num_seeds: u32,
+    /// Size of `C_d`.
+    pub num_dense: u32,
+    /// Samples drawn by the transformation estimation.
+    pub num_samples: u32,
+    /// Those of them skipped as degenerate.
+    pub num_degenerate: u32,
+    /// Score of the hypothesis; `None` if there was none.
+    pub hypothesis_score: Option<f64>,
+    /// What validation measured; `None` if there was no hypothesis.
+    pub verdict: Option<Verdict>,
+    /// Correspondences removed at its end.
+    pub num_removed: u32,
+}
+
+impl Round {
+    /// Whether the round found an instance.
+    #[must_use]
+    pub fn accepted(&self) -> bool {
+        self.verdict.is_some_and(|verdict| verdict.accepted())
+    }
+}
+
+/// Why a run ended, with the measured number and its limit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(tag = "name", rename_all = "snake_case"))]
+#[non_exhaustive]
+pub enum StopReason {
+    /// Fewer seeds than `t_s`: nothing consistent is left.
+    FewSeeds {
+        /// `N_s` of the last selection.
+        value: u32,
+        /// `t_s`.
+        threshold: u32,
+    },
+    /// Too few correspondences alive for a pose.
+    FewCorrespondences {
+        /// How many were alive.
+        value: u32,
+        /// 3.
+        threshold: u32,
+    },
+    /// `max_rounds` reached.
+    MaxRounds {
+        /// Rounds played.
+        value: u32,
+        /// The limit.
+        threshold: u32,
+    },
+    /// `max_instances` reached.
+    MaxInstances {
+        /// Instances found.
+        value: u32,
+        /// The limit.
+        threshold: u32,
+    },
+    /// `timeout_s` passed.
+    Timeout {
+        /// Seconds since the start.
+        value: f64,
+        /// The limit.
+        threshold: f64,
+    },
+    /// The observer or the cancel token ended it.
+    Cancelled,
+    /// A round removed nothing, so the next would repeat it. Only stages from outside can cause it.
+    Stalled,
+}
+
+impl std::fmt::Display for StopReason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::FewSeeds { value, threshold } => write!(f, "few_seeds: {value} seeds, {threshold} needed"),
+            Self::FewCorrespondences { value, threshold } => {
+                write!(f, "few_correspondences: {value} alive, {threshold} needed")
+            }
+            Self::MaxRounds { value, threshold } => write!(f, "max_rounds: {value} of {threshold} played"),
+            Self::MaxInstances { value, threshold } => {
+                write!(f, "max_instances: {value} of {threshold} found")
+            }
+            Self::Timeout { value, threshold } => {
+                write!(f, "timeout: {value:.3} s passed, {threshold} s allowed")
+            }
+            Self::Cancelled => f.write_str("cancelled: by callback or token"),
+            Self::Stalled => f.write_str("stalled: a round removed no correspondence"),
+        }
+    }
+}
+
+/// Seconds of wall time.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[non_exhaustive]
+pub struct Timings {
+    /// Checking the target and the correspondences, kd-tree, resolution.
+    pub prepare_s: f64,
+    /// Seed correspondence selection, all rounds.
+    pub scs_s: f64,
+    /// Correspondence enhancement, all rounds.
+    pub ce_s: f64,
+    /// Transformation estimation, all rounds.
+    pub te_s: f64,
+    /// Hypothesis validation, all rounds.
+    pub hv_s: f64,
+    /// Everything from `begin` to the result.
+    pub total_s: f64,
+}

@@ -1,0 +1,188 @@
+//! The two clouds and what is known of them: points, normals, viewpoint, kd-trees, resolution.
+
+use std::borrow::Cow;
+
+use nalgebra::{Point3, Vector3};
+
+use crate::error::{Argument, Error};
+use crate::kernels::neighbors::Neighbors;
+
+/// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
+#[derive(Debug, Clone, Default)]
+pub struct Cloud<'a> {
+    pub(crate) points: Cow<'a, [Point3<f64>]>,
+    pub(crate) normals: Option<Vec<Vector3<f64>>>,
+    pub(crate) viewpoint: Option<Point3<f64>>,
+}
+
+impl<'a> Cloud<'a> {
+    /// A cloud that borrows its points, in any unit of length (the same for both clouds).
+    #[must_use]
+    pub fn new(points: &'a [Point3<f64>]) -> Self {
+        Self { points: Cow::Borrowed(points), ..Self::default() }
+    }
+
+    /// One normal per point; any length but 0.
+    #[must_use]
+    pub fn with_normals(mut self, normals: Vec<Vector3<f64>>) -> Self {
+        self.normals = Some(normals);
+        self
+    }
+
+    /// Where the depth camera stood, in the frame of the points; for scenes seen from one side.
+    #[must_use]
+    pub fn with_viewpoint(mut self, viewpoint: Point3<f64>) -> Self {
+        self.viewpoint = Some(viewpoint);
+        self
+    }
+}
+
+impl From<Vec<Point3<f64>>> for Cloud<'static> {
+    fn from(points: Vec<Point3<f64>>) -> Self {
+        Self { points: Cow::Owned(points), ..Self::default() }
+    }
+}
+
+impl From<Vec<[f64; 3]>> for Cloud<'static> {
+    fn from(rows: Vec<[f64; 3]>) -> Self {
+        rows.into_iter().map(Point3::from).collect::<Vec<_>>().into()
+    }
+}
+
+/// A cloud that was checked, with its kd-tree and its spacing.
+#[derive(Debug)]
+pub struct PreparedCloud<'a> {
+    /// The points, in data units.
+    pub points: Cow<'a, [Point3<f64>]>,
+    /// Unit normals, one per point.
+    pub normals: Option<Vec<Vector3<f64>>>,
+    /// Where the depth camera stood.
+    pub viewpoint: Option<Point3<f64>>,
+    /// kd-tree over the points.
+    pub neighbors: Neighbors,
+    /// Mean distance of a point to its nearest other point, in data units.
+    pub spacing: f64,
+    /// Diagonal of the bounding box, in data units.
+    pub extent: f64,
+}
+
+impl<'a> PreparedCloud<'a> {
+    /// Checks `cloud` and builds what the stages need. `argument` and `normals` are what errors call them.
+    pub(crate) fn new(cloud: &Cloud<'a>, argument: Argument, normals: Argument) -> Result<Self, Error> {
+        let points = &cloud.points;
+        check_points(points, argument)?;
+        if points.len() < 3 {
+            return Err(Error::TooFewPoints { argument, len: points.len() });
+        }
+        if points.len() > u32::MAX as usize {
+            return Err(Error::TooMany { argument, len: points.len() });
+        }
+        if let Some(viewpoint) = cloud.viewpoint {
+            check_points(&[viewpoint], Argument::Viewpoint)?;
+        }
+        let unit_normals = cloud
+            .normals
+            .as_deref()
+            .map(|rows| normalised(rows, normals, points.len(), argument))
+            .transpose()?;
+        let extent = extent(points);
+        if extent <= 0.0 {
+            return Err(Error::NoExtent { argument });
+        }
+        let neighbors = Neighbors::new(points);
+        let spacing = neighbors.mean_spacing(points);
+        Ok(Self {
+            points: points.clone(),
+            normals: unit_normals,
+            viewpoint: cloud.viewpoint,
+            neighbors,
+            spacing,
+            extent,
+        })
+    }
+}
+
+/// Both clouds of a run.
+#[derive(Debug)]
+pub struct Scene<'a> {
+    /// The source (model).
+    pub source: &'a PreparedCloud<'a>,
+    /// The target (scene).
+    pub target: PreparedCloud<'a>,
+    /// pr: the mean of the two clouds' spacings, or the value given in the parameters. Data units.
+    pub resolution: f64,
+}
+
+impl<'a> Scene<'a> {
+    pub(crate) fn new(
+        source: &'a PreparedCloud<'a>,
+        target: PreparedCloud<'a>,
+        resolution: Option<f64>,
+    ) -> Result<Self, Error> {
+        match (&source.normals, &target.normals) {
+            (Some(_), None) => {
+                return Err(Error::NormalsOfOneCloud {
+                    given: Argument::SrcNormals,
+                    missing: Argument::TgtNormals,
+                });
+            }
+            (None, Some(_)) => {
+                return Err(Error::NormalsOfOneCloud {
+                    given: Argument::TgtNormals,
+                    missing: Argument::SrcNormals,
+                });
+            }
+            _ => {}
+        }
+        // Metres against millimetres would make pr so coarse that a whole cloud fits into one point, and any
+        // pose overlaps perfectly. The test needs no factor: below it no registration makes sense.
+        for (small, s, large, l) in
+            [(Argument::Src, source, Argument::Tgt, &target), (Argument::Tgt, &target, Argument::Src, source)]
+        {
+            if s.extent < l.spacing {
+                return Err(Error::DifferentUnits { small, extent: s.extent, large, spacing: l.spacing });
+            }
+        }
+        let resolution = resolution.unwrap_or(0.5 * (source.spacing + target.spacing));
+        if resolution <= 0.0 {
+            // Points all in coincident pairs: no spacing, although there is an extent.
+            return Err(Error::NoExtent { argument: Argument::Src });
+        }
+        Ok(Self { source, target, resolution })
+    }
+}
+
+/// Above this a square is no longer finite in `f64`, whatever it is multiplied with.
+const MAX_COORDINATE: f64 = 1e100;
+
+pub(crate) fn check_points(points: &[Point3<f64>], argument: Argument) -> Result<(), Error> {
+    let bad = |p: &Point3<f64>| !p.iter().all(|x| x.abs() < MAX_COORDINATE); // catches NaN too
+    match points.iter().position(bad) {
+        Some(row) => Err(Error::NotFinite { argument, row, value: points[row].coords.into() }),
+        None => Ok(()),
+    }
+}
+
+fn normalised(
+    rows: &[Vector3<f64>],
+    argument: Argument,
+    expected: usize,
+    of: Argument,
+) -> Result<Vec<Vector3<f64>>, Error> {
+    if rows.len() != expected {
+        return Err(Error::LengthMismatch { argument, len: rows.len(), of, expected });
+    }
+    let unit = |(row, n): (usize, &Vector3<f64>)| {
+        if !n.iter().all(|x| x.abs() < MAX_COORDINATE) {
+            return Err(Error::NotFinite { argument, row, value: (*n).into() });
+        }
+        n.try_normalize(0.0).ok_or(Error::ZeroNormal { argument, row })
+    };
+    rows.iter().enumerate().map(unit).collect()
+}
+
+fn extent(points: &[Point3<f64>]) -> f64 {
+    let Some(&first) = points.first() else { return 0.0 };
+    let (low, high) = points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)));
+    (high - low).norm()
+}

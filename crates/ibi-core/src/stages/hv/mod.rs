@@ -1,0 +1,33 @@
+//! HV, hypothesis validation: pose, source, target -> accepted or rejected.
+
+mod inlier_count;
+mod none;
+mod overlap;
+
+pub use inlier_count::InlierCount;
+pub use none::None;
+pub use overlap::Overlap;
+
+use super::{Context, Hypothesis, Validate, Verdict, variants};
+
+variants! {
+    /// The ways to validate a hypothesis.
+    Hv {
+        /// Share of source points that lie on the target.
+        Overlap = "overlap",
+        /// Number of alive correspondences that agree.
+        InlierCount = "inlier_count",
+        /// Everything is accepted.
+        None = "none",
+    }
+}
+
+impl Validate for Hv {
+    fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
+        match self {
+            Self::Overlap(overlap) => overlap.validate(context, hypothesis),
+            Self::InlierCount(count) => count.validate(context, hypothesis),
+            Self::None(none) => none.validate(context, hypothesis),
+        }
+    }
+}

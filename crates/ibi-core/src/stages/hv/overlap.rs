@@ -1,0 +1,41 @@
+use crate::error::Error;
+use crate::kernels::overlap::overlap;
+use crate::params::share;
+use crate::stages::{Context, Hypothesis, Validate, Verdict};
+
+/// `overlap`: accepts a pose if more than `t_overlap` of the source points come to lie within `d_op` of a
+/// target point (Quan et al. 2018).
+///
+/// A depth camera sees at most about half of an object, so for scenes from one view the threshold must be
+/// lower, about 0.3 to 0.4.
+#[derive(Debug, Clone, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+pub struct Overlap {
+    /// `t_overlap`: the share to exceed. 0 to 1.
+    pub t_overlap: f64,
+}
+
+impl Default for Overlap {
+    fn default() -> Self {
+        Self { t_overlap: 0.85 }
+    }
+}
+
+impl Overlap {
+    pub(super) fn check(&self) -> Result<(), Error> {
+        share("hv.t_overlap", self.t_overlap)
+    }
+}
+
+impl Validate for Overlap {
+    fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
+        let scene = context.scene;
+        let value = overlap(
+            &scene.source.points,
+            &scene.target.neighbors,
+            &hypothesis.target_from_source,
+            context.length(context.params.d_op_pr),
+        );
+        Verdict { value, threshold: self.t_overlap }
+    }
+}

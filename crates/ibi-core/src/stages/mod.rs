@@ -1,0 +1,208 @@
+//! The four stages: what each is asked, what it answers, and what passes between them.
+//!
+//! Each stage is an open trait, for a type of your own, and a closed enum of the variants that parameter files
+//! can name. The enum implements the trait by asking the variant it holds.
+
+pub mod ce;
+pub mod hv;
+pub mod scs;
+pub mod te;
+
+use nalgebra::Isometry3;
+
+use crate::correspondence::{Alive, PointPairs};
+use crate::interrupt::Interrupt;
+use crate::kernels::rng::Rng;
+use crate::params::Params;
+use crate::scene::Scene;
+
+/// SCS: picks from the alive correspondences a few that are highly consistent with each other.
+pub trait SelectSeeds: Send + Sync {
+    /// The seeds `C_s`; empty when there are none.
+    fn select_seeds(&self, context: &Context<'_>) -> Ranked;
+}
+
+/// CE: gathers the alive correspondences that agree with the seeds.
+pub trait Enhance: Send + Sync {
+    /// The dense correspondences `C_d`, best first.
+    fn enhance(&self, context: &Context<'_>, seeds: &Ranked) -> Ranked;
+}
+
+/// TE: estimates one pose from the dense correspondences.
+pub trait EstimatePose: Send + Sync {
+    /// The best hypothesis found, and how many were tried.
+    fn estimate_pose(&self, context: &Context<'_>, dense: &Ranked) -> Estimate;
+}
+
+/// HV: holds the pose against the two clouds.
+pub trait Validate: Send + Sync {
+    /// Accepted or rejected, with the measured value.
+    fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict;
+}
+
+/// What a stage sees of the run: the input, what is alive, the parameters, the round.
+#[derive(Debug, Clone, Copy)]
+pub struct Context<'a> {
+    /// The two clouds and the resolution.
+    pub scene: &'a Scene<'a>,
+    /// All correspondences, by id.
+    pub pairs: &'a PointPairs,
+    /// Those that no round has removed yet.
+    pub alive: &'a Alive,
+    /// The parameters of the run, already checked.
+    pub params: &'a Params,
+    /// Number of the round, from 0.
+    pub round: u32,
+    /// Asked by long computations, which may then return anything: the round is thrown away.
+    pub interrupt: &'a Interrupt,
+}
+
+impl Context<'_> {
+    /// `length_pr` in data units.
+    #[must_use]
+    pub fn length(&self, length_pr: f64) -> f64 {
+        length_pr * self.scene.resolution
+    }
+
+    /// The random stream of `stage` in this round, and no other's.
+    #[must_use]
+    pub fn rng(&self, stage: Stage) -> Rng {
+        Rng::new(self.params.seed, self.round, stage as u32)
+    }
+}
+
+/// The stages, as keys of random streams.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Stage {
+    Scs,
+    Ce,
+    Te,
+    Hv,
+}
+
+/// Correspondences with a score each (finite, >= 0), best first, ties by the lower id.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Ranked {
+    ids: Vec<u32>,
+    scores: Vec<f32>,
+}
+
+impl Ranked {
+    /// Ranks `(id, score)` pairs; the ids must differ.
+    #[must_use]
+    pub fn new(mut scored: Vec<(u32, f32)>) -> Self {
+        scored.sort_unstable_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        let (ids, scores) = scored.into_iter().unzip();
+        Self { ids, scores }
+    }
+
+    /// Keeps the best `n`.
+    #[must_use]
+    pub fn best(mut self, n: usize) -> Self {
+        self.ids.truncate(n);
+        self.scores.truncate(n);
+        self
+    }
+
+    /// The ids, best first.
+    #[must_use]
+    pub fn ids(&self) -> &[u32] {
+        &self.ids
+    }
+
+    /// The scores, in the order of [`Self::ids`].
+    #[must_use]
+    pub fn scores(&self) -> &[f32] {
+        &self.scores
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.ids.is_empty()
+    }
+}
+
+/// A pose that was estimated but not validated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hypothesis {
+    /// Moves source points onto the target; data units.
+    pub target_from_source: Isometry3<f64>,
+    /// What its stage ranked it by; MAE (Eq. 7-8) in every variant here.
+    pub score: f64,
+}
+
+/// What a transformation estimation came to.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Estimate {
+    /// The best hypothesis; `None` if every sample was degenerate.
+    pub hypothesis: Option<Hypothesis>,
+    /// Samples drawn.
+    pub num_samples: u32,
+    /// Samples skipped because their points were too near to one line.
+    pub num_degenerate: u32,
+}
+
+/// A measured value against its threshold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub struct Verdict {
+    /// What was measured.
+    pub value: f64,
+    /// What it must exceed.
+    pub threshold: f64,
+}
+
+impl Verdict {
+    /// Accepted exactly if the value exceeds the threshold.
+    #[must_use]
+    pub fn accepted(&self) -> bool {
+        self.value > self.threshold
+    }
+}
+
+/// Declares the closed set of a stage's variants: the enum, its names, its defaults, its range checks.
+macro_rules! variants {
+    ($(#[$doc:meta])* $name:ident { $($(#[$vdoc:meta])* $variant:ident = $word:literal,)+ }) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, PartialEq)]
+        #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+        #[cfg_attr(feature = "serde", serde(tag = "variant"))]
+        #[non_exhaustive]
+        pub enum $name {
+            $($(#[$vdoc])* #[cfg_attr(feature = "serde", serde(rename = $word))] $variant($variant),)+
+        }
+
+        $(impl From<$variant> for $name {
+            fn from(params: $variant) -> Self {
+                Self::$variant(params)
+            }
+        })+
+
+        impl $name {
+            /// Every variant with its default parameters; what conformance tests and benches run over.
+            #[must_use]
+            pub fn all() -> Vec<Self> {
+                vec![$(Self::$variant($variant::default()),)+]
+            }
+
+            /// The word that names the variant in parameter files, tables and Python.
+            #[must_use]
+            pub fn name(&self) -> &'static str {
+                match self { $(Self::$variant(_) => $word,)+ }
+            }
+
+            pub(crate) fn check(&self) -> Result<(), $crate::Error> {
+                match self { $(Self::$variant(params) => params.check(),)+ }
+            }
+        }
+    };
+}
+pub(crate) use variants;

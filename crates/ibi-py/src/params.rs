@@ -1,0 +1,62 @@
+//! Parameters cross the border as JSON text: one source of defaults, ranges and unknown keys, the core's.
+
+use ibi_core::Params;
+use pyo3::prelude::*;
+
+use crate::{ParamsError, to_py_err};
+
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(preset, m)?)?;
+    m.add_function(wrap_pyfunction!(check_params, m)?)?;
+    m.add_function(wrap_pyfunction!(params_to_toml, m)?)?;
+    m.add_function(wrap_pyfunction!(params_from_toml, m)?)
+}
+
+/// Params from JSON, checked.
+pub(crate) fn parse(json: &str) -> PyResult<Params> {
+    let params: Params = serde_json::from_str(json).map_err(invalid)?;
+    params.validate().map_err(|e| to_py_err(&e))?;
+    Ok(params)
+}
+
+fn to_json(params: &Params) -> PyResult<String> {
+    serde_json::to_string(params).map_err(invalid)
+}
+
+fn invalid(error: impl std::fmt::Display) -> PyErr {
+    // toml's messages span lines and draw the place; the first line and the last say it all.
+    let message = error.to_string();
+    let first = message.lines().next().unwrap_or_default();
+    let last = message.lines().last().unwrap_or_default();
+    let both = if first == last { first.to_owned() } else { format!("{first}: {last}") };
+    ParamsError::new_err(format!("params: {both}"))
+}
+
+#[pyfunction]
+fn preset(name: &str) -> PyResult<String> {
+    let params = match name {
+        "default" => Params::default(),
+        "paper_synthetic" => Params::paper_synthetic(),
+        "paper_real" => Params::paper_real(),
+        _ => return Err(ParamsError::new_err(format!("no preset is called {name:?}"))),
+    };
+    to_json(&params)
+}
+
+/// Checks JSON and returns it complete, with the defaults of what it leaves out.
+#[pyfunction]
+fn check_params(json: &str) -> PyResult<String> {
+    to_json(&parse(json)?)
+}
+
+#[pyfunction]
+fn params_to_toml(json: &str) -> PyResult<String> {
+    toml::to_string(&parse(json)?).map_err(invalid)
+}
+
+#[pyfunction]
+fn params_from_toml(text: &str) -> PyResult<String> {
+    let params: Params = toml::from_str(text).map_err(invalid)?;
+    params.validate().map_err(|e| to_py_err(&e))?;
+    to_json(&params)
+}

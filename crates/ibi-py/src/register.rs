@@ -1,0 +1,189 @@
+//! `register`: arrays in, arrays out, the GIL released in between.
+
+use std::ops::ControlFlow;
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+use ibi_core::nalgebra::{Point3, Vector3};
+use ibi_core::{CancelToken, Cloud, Correspondences, Registrar, Registration, Round};
+use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::{InputError, params, to_py_err};
+
+/// How often a run in the background lets Python look for Ctrl-C.
+const SIGNAL_PERIOD: Duration = Duration::from_millis(20);
+
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_function(wrap_pyfunction!(register_clouds, m)?)
+}
+
+/// See `ibi_rs.register`, which brings its arguments into the shapes and dtypes that are wanted here.
+#[pyfunction(name = "register")]
+#[pyo3(signature = (src, tgt, corr, params, *, src_normals=None, tgt_normals=None, similarity=None, viewpoint=None, num_threads=None, on_round=None))]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's keyword arguments; PyO3 owns
+fn register_clouds<'py>(
+    py: Python<'py>,
+    src: PyReadonlyArray2<'py, f64>,
+    tgt: PyReadonlyArray2<'py, f64>,
+    corr: &Bound<'py, PyAny>,
+    params: &str,
+    src_normals: Option<PyReadonlyArray2<'py, f64>>,
+    tgt_normals: Option<PyReadonlyArray2<'py, f64>>,
+    similarity: Option<PyReadonlyArray1<'py, f64>>,
+    viewpoint: Option<[f64; 3]>,
+    num_threads: Option<usize>,
+    on_round: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let params = params::parse(params)?;
+    let source = cloud(&src, src_normals.as_ref())?;
+    let mut target = cloud(&tgt, tgt_normals.as_ref())?;
+    if let Some(viewpoint) = viewpoint {
+        target = target.with_viewpoint(Point3::from(viewpoint));
+    }
+    let mut correspondences = correspondences(corr)?;
+    if let Some(similarity) = similarity {
+        correspondences = correspondences.with_similarity(similarity.as_array().to_vec());
+    }
+    let registration = in_background(py, |cancel| {
+        let mut failure = None;
+        let mut observer = |round: &Round| match tell(on_round.as_ref(), round) {
+            Ok(flow) => flow,
+            Err(error) => {
+                failure = Some(error);
+                ControlFlow::Break(())
+            }
+        };
+        let run = || {
+            let mut registrar = Registrar::new(&source)?.params(params).cancel_token(cancel);
+            if let Some(num_threads) = num_threads {
+                registrar = registrar.num_threads(num_threads);
+            }
+            registrar.register_observed(&target, &correspondences, &mut observer)
+        };
+        let result = run().map_err(|e| to_py_err(&e));
+        failure.map_or(result, Err)
+    })?;
+    to_dict(py, &registration)
+}
+
+/// Runs `job` on a thread of its own with the GIL released, while this one, which alone may see signals, looks
+/// for Ctrl-C. A signal cancels the job and is raised once the job has ended.
+fn in_background<T: Send>(
+    py: Python<'_>,
+    job: impl FnOnce(CancelToken) -> PyResult<T> + Send,
+) -> PyResult<T> {
+    let cancel = CancelToken::default();
+    let token = cancel.clone();
+    py.detach(|| {
+        std::thread::scope(|scope| {
+            let (done, is_done) = channel::<()>();
+            let worker = scope.spawn(move || {
+                let result = job(token);
+                drop(done);
+                result
+            });
+            let mut signal = Ok(());
+            while is_done.recv_timeout(SIGNAL_PERIOD) == Err(RecvTimeoutError::Timeout) {
+                if signal.is_ok() {
+                    #[allow(clippy::redundant_closure_for_method_calls)] // the lifetime wants the closure
+                    let checked = Python::attach(|py| py.check_signals());
+                    signal = checked;
+                    if signal.is_err() {
+                        cancel.cancel();
+                    }
+                }
+            }
+            let result = worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+            signal.and(result)
+        })
+    })
+}
+
+/// Calls the Python callback; `False` ends the run.
+fn tell(callback: Option<&Py<PyAny>>, round: &Round) -> PyResult<ControlFlow<()>> {
+    let Some(callback) = callback else { return Ok(ControlFlow::Continue(())) };
+    let round = json(round)?;
+    Python::attach(|py| {
+        let answer = callback.bind(py).call1((round,))?;
+        let stop = answer.is_instance_of::<pyo3::types::PyBool>() && !answer.is_truthy()?;
+        Ok(if stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
+    })
+}
+
+fn cloud(
+    points: &PyReadonlyArray2<'_, f64>,
+    normals: Option<&PyReadonlyArray2<'_, f64>>,
+) -> PyResult<Cloud<'static>> {
+    let cloud = Cloud::from(rows3(points)?);
+    Ok(match normals {
+        Some(normals) => cloud.with_normals(rows3(normals)?.into_iter().map(Vector3::from).collect()),
+        None => cloud,
+    })
+}
+
+fn rows3(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<[f64; 3]>> {
+    let array = array.as_array();
+    if array.ncols() != 3 {
+        return Err(InputError::new_err(format!("expected 3 columns, got {}", array.ncols())));
+    }
+    Ok(array.rows().into_iter().map(|r| [r[0], r[1], r[2]]).collect())
+}
+
+/// (M, 2) int64 rows or (M, 6) float64 points.
+fn correspondences(corr: &Bound<'_, PyAny>) -> PyResult<Correspondences> {
+    if let Ok(rows) = corr.extract::<PyReadonlyArray2<'_, i64>>() {
+        let rows = rows.as_array();
+        if rows.ncols() != 2 {
+            return Err(InputError::new_err("corr of int64 must have 2 columns"));
+        }
+        // A negative index wraps to one that is out of range; the core refuses it and reports it as it was.
+        let wrap = |index: i64| usize::try_from(index).unwrap_or(index as usize);
+        return Ok(Correspondences::from_rows(rows.rows().into_iter().map(|r| [wrap(r[0]), wrap(r[1])]).collect()));
+    }
+    let points: PyReadonlyArray2<'_, f64> = corr.extract()?;
+    let points = points.as_array();
+    if points.ncols() != 6 {
+        return Err(InputError::new_err("corr of float64 must have 6 columns"));
+    }
+    let pair = |i: usize| [0, 3].map(|c| Point3::new(points[[i, c]], points[[i, c + 1]], points[[i, c + 2]]));
+    Ok(Correspondences::from_points((0..points.nrows()).map(pair).collect()))
+}
+
+/// Arrays as arrays, the rest as JSON under "report".
+fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyResult<Bound<'py, PyDict>> {
+    let poses = &registration.poses;
+    // nalgebra stores columns, numpy rows.
+    let rows = poses.iter().flat_map(|p| {
+        let matrix = p.target_from_source.to_homogeneous().transpose();
+        matrix.iter().copied().collect::<Vec<f64>>()
+    });
+    let matrices: Bound<'py, PyArray3<f64>> =
+        PyArray1::from_iter(py, rows).reshape([poses.len(), 4, 4])?;
+    let column = |f: fn(&ibi_core::Pose) -> f64| PyArray1::from_iter(py, poses.iter().map(f));
+    let inliers: Vec<_> = poses
+        .iter()
+        .map(|p| PyArray1::from_iter(py, p.inliers.iter().map(|&id| i64::from(id))))
+        .collect();
+    let labels = registration.labels.iter().map(|label| label.map_or(-1, u32::cast_signed));
+    let result = PyDict::new(py);
+    result.set_item("target_from_source", matrices)?;
+    result.set_item("score", column(|p| p.score))?;
+    result.set_item("overlap", column(|p| p.overlap))?;
+    result.set_item("inlier_rmse", column(|p| p.inlier_rmse))?;
+    result.set_item("inliers", inliers)?;
+    result.set_item("round", PyArray1::from_iter(py, poses.iter().map(|p| i64::from(p.round))))?;
+    result.set_item("labels", PyArray1::from_iter(py, labels))?;
+    result.set_item("rounds", json(&registration.rounds)?)?;
+    result.set_item("stop_reason", json(&registration.stop_reason)?)?;
+    result.set_item("stop_message", registration.stop_reason.to_string())?;
+    result.set_item("timings", json(&registration.timings)?)?;
+    result.set_item("resolution", registration.resolution)?;
+    Ok(result)
+}
+
+fn json(value: &impl serde::Serialize) -> PyResult<String> {
+    serde_json::to_string(value).map_err(|e| PyValueError::new_err(e.to_string()))
+}

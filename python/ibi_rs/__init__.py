@@ -1,0 +1,34 @@
+"""Multi-instance 3D registration: the 6-DoF pose of every copy of a model in a scene.
+
+Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
+"""
+
+from ibi_rs import metrics, synth
+from ibi_rs._core import InputError, ParamsError, __version__
+from ibi_rs._register import register
+from ibi_rs.params import Gsac, Gtm, InlierCount, None_, Off, Overlap, Params, Ransac, Voting
+from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
+
+__all__ = [
+    "Gsac",
+    "Gtm",
+    "InlierCount",
+    "InputError",
+    "None_",
+    "Off",
+    "Overlap",
+    "Params",
+    "ParamsError",
+    "Pose",
+    "Ransac",
+    "Registration",
+    "Round",
+    "StopReason",
+    "Timings",
+    "Verdict",
+    "Voting",
+    "__version__",
+    "metrics",
+    "register",
+    "synth",
+]

@@ -1,0 +1,204 @@
+"""`register`: brings what users hold into arrays, calls the core, dresses the answer."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ibi_rs import _core
+from ibi_rs.params import Params
+from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
+
+Points = Any
+"""(N, 3) real numbers, or an object with ``.points``, ``.vertices`` or ``__array__``."""
+
+
+def register(
+    src: Points,
+    tgt: Points,
+    corr: Any,
+    params: Params | None = None,
+    *,
+    src_normals: npt.ArrayLike | None = None,
+    tgt_normals: npt.ArrayLike | None = None,
+    similarity: npt.ArrayLike | None = None,
+    viewpoint: npt.ArrayLike | None = None,
+    num_threads: int | None = None,
+    max_instances: int | None = None,
+    timeout_s: float | None = None,
+    callback: Callable[[Round], object] | None = None,
+) -> Registration:
+    """Find every instance of a model in a scene.
+
+    Parameters
+    ----------
+    src, tgt : (N, 3) array_like
+        The model (source) and the scene (target) in the same unit of length, of any real dtype; or an object
+        with ``.points`` (Open3D), ``.vertices`` (trimesh) or ``__array__``. At least 3 points each.
+    corr : (M, 2) array_like of int, (M, 6) array_like, or pair of (M, 3) arrays
+        Putative correspondences: [source row, target row], or the source point and the target point
+        themselves.
+    params : Params, optional
+        Default ``Params()``.
+    src_normals, tgt_normals : (N, 3) array_like, optional
+        Normals of both clouds, or of neither; any length but 0. No variant of this version uses them yet.
+    similarity : (M,) array_like, optional
+        How alike the two descriptors of each correspondence are; larger is better. Not used yet.
+    viewpoint : (3,) array_like, optional
+        Where the depth camera stood, in the frame of ``tgt``. Not used yet.
+    num_threads : int, optional
+        Default: the environment variable ``IBI_NUM_THREADS``, else the cores the process may use. The result
+        does not depend on it.
+    max_instances, timeout_s : optional
+        Override those of ``params``.
+    callback : callable, optional
+        Called with a :class:`Round` after each round; returning False ends the run and keeps what is found.
+
+    Returns
+    -------
+    Registration
+        The poses, best score first; empty if there is none, and ``stop_reason`` says why the run ended.
+
+    Raises
+    ------
+    InputError
+        An array has a wrong shape, a value that is not finite, or an index out of range; the message names
+        the argument, the place and what is allowed. A ValueError.
+    ParamsError
+        A parameter is out of range. A ValueError.
+    TypeError
+        An array has a dtype that cannot be used.
+
+    Notes
+    -----
+    The GIL is released. Ctrl-C ends the run within 0.1 s.
+
+    References
+    ----------
+    Cao et al., "Instance by Instance: An Iterative Framework for Multi-instance 3D Registration".
+
+    Examples
+    --------
+    >>> import ibi_rs as ibi
+    >>> scene = ibi.synth.outlier_layout(seed=1, num_instances=5)
+    >>> found = ibi.register(scene.src, scene.tgt, scene.corr)
+    >>> found[0].target_from_source.shape
+    (4, 4)
+    """
+    params = params if params is not None else Params()
+    if not isinstance(params, Params):
+        raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+    overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
+    params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
+
+    raw = _core.register(
+        _points("src", src),
+        _points("tgt", tgt),
+        _correspondences(corr),
+        json.dumps(params.to_dict()),
+        src_normals=None if src_normals is None else _points("src_normals", src_normals),
+        tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
+        similarity=None if similarity is None else _vector("similarity", similarity),
+        viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
+        num_threads=_num_threads(num_threads),
+        on_round=callback and (lambda text: callback(Round._from_dict(json.loads(text)))),
+    )
+    return _registration(raw, params)
+
+
+def _registration(raw: dict[str, Any], params: Params) -> Registration:
+    columns = ("target_from_source", "score", "overlap", "inlier_rmse", "inliers", "round")
+    poses = []
+    for matrix, score, overlap, inlier_rmse, inliers, index in zip(*(raw[c] for c in columns), strict=True):
+        poses.append(Pose(matrix, float(score), float(overlap), float(inlier_rmse), inliers, int(index)))
+    return Registration(
+        poses,
+        labels=raw["labels"],
+        rounds=[Round._from_dict(data) for data in json.loads(raw["rounds"])],
+        stop_reason=StopReason(message=raw["stop_message"], **json.loads(raw["stop_reason"])),
+        timings=Timings(**json.loads(raw["timings"])),
+        resolution=raw["resolution"],
+        params=params,
+    )
+
+
+def _real(name: str, value: Any) -> npt.NDArray[Any]:
+    """Any array of real numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # ragged lists
+        raise _core.InputError(f"{name} is not a rectangular array: {error}") from None
+    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+        raise TypeError(f"{name} has dtype {array.dtype}; it must be real numbers")
+    return array
+
+
+def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
+    """(N, 3) float64, from an array or from an object that holds one."""
+    if not isinstance(value, np.ndarray):
+        for attribute in ("points", "vertices"):
+            value = getattr(value, attribute, value)
+    array = _real(name, value)
+    if array.size == 0:
+        array = array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
+    return array.astype(np.float64, copy=False)
+
+
+def _vector(name: str, value: Any) -> npt.NDArray[np.float64]:
+    array = _real(name, value)
+    if array.ndim != 1:
+        raise _core.InputError(f"{name} has shape {array.shape}; it must be (M,)")
+    return array.astype(np.float64, copy=False)
+
+
+def _viewpoint(value: Any) -> list[float]:
+    array = _real("viewpoint", value)
+    if array.shape != (3,):
+        raise _core.InputError(f"viewpoint has shape {array.shape}; it must be (3,)")
+    return [float(x) for x in array]
+
+
+def _correspondences(value: Any) -> npt.NDArray[Any]:
+    """(M, 2) int64 rows or (M, 6) float64 points."""
+    if isinstance(value, tuple) and len(value) == 2 and all(np.ndim(side) == 2 for side in value):
+        source, target = _points("corr[0]", value[0]), _points("corr[1]", value[1])
+        if len(source) != len(target):
+            raise _core.InputError(f"corr is a pair of {len(source)} and {len(target)} points; it must be of equally many")
+        return np.hstack([source, target])
+    if not isinstance(value, np.ndarray):
+        for attribute in ("correspondence_set",):  # Open3D's RegistrationResult
+            value = getattr(value, attribute, value)
+    array = np.asarray(value) if np.size(value) == 0 else _real("corr", value)
+    if array.size == 0:
+        return np.empty((0, 2), np.int64)
+    if array.ndim != 2 or array.shape[1] not in (2, 6):
+        raise _core.InputError(f"corr has shape {array.shape}; it must be (M, 2) rows or (M, 6) points")
+    if array.shape[1] == 6:
+        return array.astype(np.float64, copy=False)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise TypeError(f"corr of shape (M, 2) has dtype {array.dtype}; rows must be integers")
+    # Indices beyond int64 are out of any range; clipped, the core still refuses them and says where.
+    if array.dtype == np.uint64:
+        array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
+    return array.astype(np.int64, copy=False)
+
+
+def _num_threads(value: int | None) -> int | None:
+    name, given = "num_threads", value
+    if value is None:
+        name, text = "IBI_NUM_THREADS", os.environ.get("IBI_NUM_THREADS", "")
+        if not text:
+            return None
+        given = int(text) if text.isdecimal() else 0
+        if given < 1:
+            raise ValueError(f"IBI_NUM_THREADS is {text!r}; it must be an integer of at least 1")
+    if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 1:
+        raise ValueError(f"{name} is {given!r}; it must be an integer of at least 1")
+    return int(given)

@@ -1,0 +1,342 @@
+"""Parameters: frozen dataclasses, one block per stage.
+
+Every length ends in ``_pr`` and is a multiple of the resolution ``pr``, the mean of the two clouds' mean
+nearest-neighbour distances, so nothing depends on the unit of the data. Defaults and ranges are the Rust
+core's; a value out of range raises :class:`~ibi_rs.ParamsError` where the object is made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Literal, TypeVar, get_args
+
+from ibi_rs import _core
+
+_P = TypeVar("_P", bound="Params")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gtm:
+    """SCS ``gtm``: a sample of the correspondences plays a game of mutual support (Eq. 2-4).
+
+    Parameters
+    ----------
+    n_downsample
+        N_downsample: correspondences that play, drawn anew each round; 3 to 16384. Memory: 4 n^2 bytes.
+    n_gtm
+        N_gtm: generations of the replicator; at least 1.
+    payoff
+        What two correspondences gain from each other: ``"gaussian"``, exp(-r^2 / delta_r^2), or ``"ratio"``,
+        min(a/b, b/a), with a, b the distances of their source and target points and r = abs(a - b).
+
+    References
+    ----------
+    Rodola et al., "A Scale Independent Selection Process for 3D Object Recognition in Cluttered Scenes", 2013.
+    """
+
+    variant: ClassVar[str] = "gtm"
+    n_downsample: int = 1024
+    n_gtm: int = 20
+    payoff: Literal["gaussian", "ratio"] = "gaussian"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Voting:
+    """CE ``voting``: every seed votes for every alive correspondence by their consistency (Eq. 5-6).
+
+    Parameters
+    ----------
+    n_vot
+        N_vot: the correspondences with the most votes that go on; at least 3. With removal ``"dense"`` each
+        round takes them out, so it should be about as many as one instance has.
+
+    References
+    ----------
+    Yang et al., "Ranking 3D Feature Correspondences via Consistency Voting", 2019.
+    """
+
+    variant: ClassVar[str] = "voting"
+    n_vot: int = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Off:
+    """CE ``off``: the seeds go on as they are, ranked by their share of the population."""
+
+    variant: ClassVar[str] = "off"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gsac:
+    """TE ``gsac``: the triplets with the largest sum of votes give a pose each; the best MAE wins (Eq. 7-8).
+
+    Parameters
+    ----------
+    n_gsac
+        N_gsac: triplets tried; at least 1.
+    min_height_pr
+        Triplets whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
+
+    References
+    ----------
+    Yang et al., "Toward Efficient and Robust Metrics for RANSAC Hypotheses and 3D Rigid Registration", 2021.
+    """
+
+    variant: ClassVar[str] = "gsac"
+    n_gsac: int = 100
+    min_height_pr: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ransac:
+    """TE ``ransac``: triplets drawn uniformly give a pose each; the best MAE wins (Eq. 7-8).
+
+    Parameters
+    ----------
+    n_ransac
+        Triplets drawn; 1 to 10,000,000.
+    min_height_pr
+        Triplets whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
+
+    References
+    ----------
+    Fischler & Bolles, "Random Sample Consensus", 1981.
+    """
+
+    variant: ClassVar[str] = "ransac"
+    n_ransac: int = 1000
+    min_height_pr: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overlap:
+    """HV ``overlap``: accepts a pose if enough source points come to lie within ``d_op`` of a target point.
+
+    Parameters
+    ----------
+    t_overlap
+        The share to exceed, 0 to 1. A depth camera sees at most about half of an object: for scenes from one
+        view 0.3 to 0.4.
+
+    References
+    ----------
+    Quan et al., "Local Voxelized Structure for 3D Binary Feature Representation and Robust Registration", 2018.
+    """
+
+    variant: ClassVar[str] = "overlap"
+    t_overlap: float = 0.85
+
+
+@dataclass(frozen=True, kw_only=True)
+class InlierCount:
+    """HV ``inlier_count``: accepts a pose if enough alive correspondences have a residual below ``t_he``.
+
+    Parameters
+    ----------
+    t_inliers
+        The count to exceed; at least 1. The paper tries 50, 100 and 150.
+    """
+
+    variant: ClassVar[str] = "inlier_count"
+    t_inliers: int = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class None_:
+    """HV ``none``: accepts every pose, as in the paper's ablation."""
+
+    variant: ClassVar[str] = "none"
+
+
+Scs = Gtm
+Ce = Voting | Off
+Te = Gsac | Ransac
+Hv = Overlap | InlierCount | None_
+Removal = Literal["dense"]
+
+_STAGES: dict[str, tuple[type[Any], ...]] = {
+    "scs": (Gtm,),
+    "ce": get_args(Ce),
+    "te": get_args(Te),
+    "hv": get_args(Hv),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Params:
+    """How a registration runs. The default is :meth:`paper_synthetic` with ``t_he_pr`` 3.
+
+    A stage may be given by its word, ``Params(ce="off")``, which takes that variant's defaults.
+
+    Parameters
+    ----------
+    seed
+        Key of all random streams: the same seed gives the same bits, for any number of threads; >= 0.
+    resolution
+        pr in data units; None estimates it from the clouds.
+    delta_r_pr
+        delta_r of Eq. 5: how fast payoff and votes fall with the rigidity, in pr; > 0.
+    t_he_pr
+        t_he of Eq. 8: largest residual of an inlier, in pr; > 0.
+    d_op_pr
+        d_op: largest distance of overlapping points, in pr; > 0.
+    t_s
+        t_s: a run ends when fewer seeds than this are found; at least 3.
+    scs, ce, te, hv
+        The four stages: seed correspondence selection, correspondence enhancement, transformation estimation,
+        hypothesis validation.
+    removal
+        Which correspondences a round removes; ``"dense"``: those that the enhancement ranked.
+    max_rounds, max_instances
+        A run ends after so many rounds or instances; None: no limit.
+    timeout_s
+        A run ends after so many seconds and keeps what it has; None: no limit.
+
+    Raises
+    ------
+    ParamsError
+        A value is out of its range; the message names it and says what is allowed.
+
+    References
+    ----------
+    Cao et al., "Instance by Instance: An Iterative Framework for Multi-instance 3D Registration".
+
+    Examples
+    --------
+    >>> import ibi_rs as ibi
+    >>> ibi.Params(hv=ibi.Overlap(t_overlap=0.35), t_he_pr=2).hv
+    Overlap(t_overlap=0.35)
+    """
+
+    seed: int = 0
+    resolution: float | None = None
+    delta_r_pr: float = 10.0
+    t_he_pr: float = 3.0
+    d_op_pr: float = 1.5
+    t_s: int = 5
+    scs: Scs = Gtm()
+    ce: Ce = Voting()
+    te: Te = Gsac()
+    hv: Hv = Overlap()
+    removal: Removal = "dense"
+    max_rounds: int | None = None
+    max_instances: int | None = None
+    timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Turn words into stages and let the core check everything."""
+        for name, variants in _STAGES.items():
+            stage = getattr(self, name)
+            if isinstance(stage, str):
+                object.__setattr__(self, name, _variant(name, stage)())
+            elif not isinstance(stage, variants):
+                allowed = ", ".join(variant.__name__ for variant in variants)
+                raise _core.ParamsError(f"params.{name} is {stage!r}; it must be one of {allowed}")
+        # numpy scalars become plain numbers here, so that equality, repr and pickles are those of plain data.
+        complete = json.loads(_core.check_params(self._to_json()))
+        for name, value in _build(complete).items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def paper_synthetic(cls: type[_P]) -> _P:
+        """Return the paper's setting for its synthetic data."""
+        return cls.from_dict(json.loads(_core.preset("paper_synthetic")))
+
+    @classmethod
+    def paper_real(cls: type[_P]) -> _P:
+        """Return the paper's setting for its real data."""
+        return cls.from_dict(json.loads(_core.preset("paper_real")))
+
+    def replace(self: _P, **changes: Any) -> _P:
+        """Return a copy with ``changes``; unknown names raise TypeError."""
+        return dataclasses.replace(self, **changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain nested data; each stage carries its word under ``variant``."""
+        out: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in _STAGES:
+                value = {"variant": value.variant, **dataclasses.asdict(value)}
+            out[field.name] = value
+        return out
+
+    @classmethod
+    def from_dict(cls: type[_P], data: Mapping[str, Any]) -> _P:
+        """Build from nested data; what is missing is defaulted, an unknown key raises ParamsError."""
+        return cls(**_build(json.loads(_core.check_params(_dumps(dict(data))))))
+
+    def to_toml(self) -> str:
+        """Return the text of a parameter file."""
+        return _core.params_to_toml(self._to_json())
+
+    @classmethod
+    def from_toml(cls: type[_P], text: str) -> _P:
+        """Build from the text of a parameter file; an unknown key raises ParamsError."""
+        return cls(**_build(json.loads(_core.params_from_toml(text))))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a parameter file; ``.toml`` or ``.json``."""
+        path = Path(path)
+        text = self.to_toml() if _is_toml(path) else json.dumps(self.to_dict(), indent=2)
+        path.write_text(text, encoding="utf-8")
+
+    @classmethod
+    def load(cls: type[_P], path: str | os.PathLike[str]) -> _P:
+        """Read a parameter file; ``.toml`` or ``.json``."""
+        path = Path(path)
+        text = path.read_text(encoding="utf-8")
+        return cls.from_toml(text) if _is_toml(path) else cls.from_dict(json.loads(text))
+
+    def _to_json(self) -> str:
+        return _dumps(self.to_dict())
+
+
+def _variant(stage: str, word: str) -> type[Any]:
+    by_word = {variant.variant: variant for variant in _STAGES[stage]}
+    if word not in by_word:
+        allowed = ", ".join(map(repr, by_word))
+        raise _core.ParamsError(f"params.{stage} is {word!r}; it must be one of {allowed}")
+    return by_word[word]
+
+
+def _build(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Constructor arguments from complete, checked data."""
+    arguments = dict(data)
+    for stage in _STAGES:
+        block = dict(arguments[stage])
+        arguments[stage] = _variant(stage, block.pop("variant"))(**block)
+    return arguments
+
+
+def _dumps(data: Mapping[str, Any]) -> str:
+    for name, value in _leaves(data):
+        if isinstance(value, float) and value - value != 0.0:  # NaN and infinities, which JSON cannot say
+            raise _core.ParamsError(f"params.{name} is {value}; it must be finite")
+    return json.dumps(data, default=_plain)
+
+
+def _leaves(data: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    out: list[tuple[str, Any]] = []
+    for name, value in data.items():
+        is_block = isinstance(value, Mapping)
+        out += _leaves(value, f"{prefix}{name}.") if is_block else [(f"{prefix}{name}", value)]
+    return out
+
+
+def _plain(value: Any) -> Any:
+    """Numpy scalars as plain numbers."""
+    if hasattr(value, "item"):
+        return value.item()
+    raise _core.ParamsError(f"params: {value!r} is not a number, a string or a block of these")
+
+
+def _is_toml(path: Path) -> bool:
+    if path.suffix not in {".toml", ".json"}:
+        raise ValueError(f"{path}: a parameter file must end in .toml or .json")
+    return path.suffix == ".toml"

@@ -1,0 +1,235 @@
+"""What a registration returns: poses, labels, and how the run came to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from ibi_rs.params import Params
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """One instance.
+
+    Attributes
+    ----------
+    target_from_source : (4, 4) float64
+        Moves source points onto this instance; acts on column vectors, translation in data units.
+    score : float
+        What poses are ranked by, 0 to 1: the overlap.
+    overlap : float
+        Share of source points within ``d_op`` of a target point, 0 to 1.
+    inlier_rmse : float
+        Root mean square residual of the inliers in data units; 0 without inliers.
+    inliers : (I,) int64
+        Rows of ``corr`` with a residual below ``t_he``, ascending. A row may be an inlier of several poses.
+    round : int
+        The round that found it.
+    """
+
+    target_from_source: npt.NDArray[np.float64]
+    score: float
+    overlap: float
+    inlier_rmse: float
+    inliers: npt.NDArray[np.int64] = field(repr=False)
+    round: int
+
+    @property
+    def transformation(self) -> npt.NDArray[np.float64]:
+        """``target_from_source`` under Open3D's name."""
+        return self.target_from_source
+
+    @property
+    def num_inliers(self) -> int:
+        """Number of inliers."""
+        return len(self.inliers)
+
+    def __repr__(self) -> str:
+        t = ", ".join(f"{x:.4g}" for x in self.target_from_source[:3, 3])
+        return (
+            f"Pose(score={self.score:.3f}, overlap={self.overlap:.3f}, num_inliers={self.num_inliers}, "
+            f"inlier_rmse={self.inlier_rmse:.3g}, translation=[{t}])"
+        )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A measured value against its threshold.
+
+    Attributes
+    ----------
+    value : float
+        What was measured.
+    threshold : float
+        What it must exceed.
+    """
+
+    value: float
+    threshold: float
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the value exceeds the threshold."""
+        return self.value > self.threshold
+
+
+@dataclass(frozen=True)
+class Round:
+    """One pass through the four stages.
+
+    Attributes
+    ----------
+    index : int
+        Number of the round, from 0.
+    num_alive : int
+        Correspondences alive at its start.
+    num_seeds : int
+        N_s, seeds found.
+    num_dense : int
+        Size of C_d.
+    num_samples, num_degenerate : int
+        Samples drawn by the transformation estimation, and those of them skipped as degenerate.
+    hypothesis_score : float or None
+        Score of the hypothesis; None if there was none.
+    verdict : Verdict or None
+        What validation measured; None if there was no hypothesis.
+    num_removed : int
+        Correspondences removed at its end.
+    """
+
+    index: int
+    num_alive: int
+    num_seeds: int
+    num_dense: int
+    num_samples: int
+    num_degenerate: int
+    hypothesis_score: float | None
+    verdict: Verdict | None
+    num_removed: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the round found an instance."""
+        return self.verdict is not None and self.verdict.accepted
+
+    @classmethod
+    def _from_dict(cls, data: dict[str, Any]) -> Round:
+        verdict = data["verdict"]
+        return cls(**{**data, "verdict": verdict and Verdict(**verdict)})
+
+
+@dataclass(frozen=True)
+class StopReason:
+    """Why a run ended.
+
+    Attributes
+    ----------
+    name : str
+        ``few_seeds``, ``few_correspondences``, ``max_rounds``, ``max_instances``, ``timeout``, ``cancelled``
+        or ``stalled``.
+    value, threshold : float or None
+        The measured number and its limit, where there is one.
+    message : str
+        Both in words.
+    """
+
+    name: str
+    message: str
+    value: float | None = None
+    threshold: float | None = None
+
+    def __str__(self) -> str:
+        return self.message
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Seconds of wall time.
+
+    Attributes
+    ----------
+    prepare_s : float
+        Checking the input, kd-trees, resolution.
+    scs_s, ce_s, te_s, hv_s : float
+        The four stages, all rounds.
+    total_s : float
+        From the beginning of the run to its result.
+    """
+
+    prepare_s: float
+    scs_s: float
+    ce_s: float
+    te_s: float
+    hv_s: float
+    total_s: float
+
+
+class Registration(Sequence[Pose]):
+    """The instances found, best score first: a sequence of :class:`Pose`.
+
+    ``np.asarray(registration)`` is the (K, 4, 4) float64 array of the poses.
+
+    Attributes
+    ----------
+    labels : (M,) int32
+        For each correspondence the pose it fits best with a residual below ``t_he``, -1 for none.
+    rounds : tuple of Round
+        One entry per round that was played to its end.
+    stop_reason : StopReason
+        Why the run ended.
+    timings : Timings
+        Where the time went, in seconds.
+    resolution : float
+        pr in data units.
+    params : Params
+        The parameters of the run.
+    """
+
+    def __init__(
+        self,
+        poses: Sequence[Pose],
+        *,
+        labels: npt.NDArray[np.int32],
+        rounds: Sequence[Round],
+        stop_reason: StopReason,
+        timings: Timings,
+        resolution: float,
+        params: Params,
+    ) -> None:
+        self.poses = tuple(poses)
+        self.labels = labels
+        self.rounds = tuple(rounds)
+        self.stop_reason = stop_reason
+        self.timings = timings
+        self.resolution = resolution
+        self.params = params
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @overload
+    def __getitem__(self, index: int) -> Pose: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Pose]: ...
+    def __getitem__(self, index: int | slice) -> Pose | Sequence[Pose]:
+        return self.poses[index]
+
+    def __iter__(self) -> Iterator[Pose]:
+        return iter(self.poses)
+
+    def __array__(self, dtype: npt.DTypeLike = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        matrices = [pose.target_from_source for pose in self.poses]
+        return np.array(matrices, dtype=dtype or np.float64).reshape(-1, 4, 4)
+
+    def __repr__(self) -> str:
+        plural = "instance" if len(self) == 1 else "instances"
+        head = (
+            f"Registration: {len(self)} {plural} in {len(self.rounds)} rounds, {self.timings.total_s:.3f} s; "
+            f"stopped by {self.stop_reason}; resolution {self.resolution:.4g}"
+        )
+        return "\n".join([head, *(f"  {pose!r}" for pose in self.poses)])

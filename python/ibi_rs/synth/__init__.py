@@ -1,0 +1,18 @@
+"""Seeded synthetic scenes with known truth, for tests, examples and benchmarks.
+
+`outlier_layout` mixes true pairs with random outliers and needs numpy only; `ecc_layout` matches noisy
+descriptors and needs Open3D (``pip install 'ibi_rs[features]'``). Lengths are in radii of the source shape,
+which lies in the unit sphere. This package imports nothing else of `ibi_rs`.
+
+Examples
+--------
+>>> from ibi_rs import synth
+>>> synth.outlier_layout(7, num_instances=8).num_instances
+8
+"""
+
+from .layouts import ecc_layout, outlier_layout
+from .scene import INLIER_DISTANCE, Scene
+from .shapes import SHAPES, sample_mesh, shape
+
+__all__ = ["INLIER_DISTANCE", "SHAPES", "Scene", "ecc_layout", "outlier_layout", "sample_mesh", "shape"]
