@@ -89,7 +89,7 @@ class Gsac:
 
     variant: ClassVar[str] = "gsac"
     n_gsac: int = 100
-    min_height_pr: float = 0.1
+    min_height_pr: float = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,7 @@ class Ransac:
 
     variant: ClassVar[str] = "ransac"
     n_ransac: int = 1000
-    min_height_pr: float = 0.1
+    min_height_pr: float = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)

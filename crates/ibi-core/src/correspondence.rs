@@ -80,9 +80,7 @@ impl PointPairs {
             check_similarity(similarity, len)?;
         }
         let (source, target): (Vec<_>, Vec<_>) = match &given.pairs {
-            Pairs::Rows(rows) => {
-                (look_up(rows, 0, scene.source)?, look_up(rows, 1, &scene.target)?)
-            }
+            Pairs::Rows(rows) => (look_up(rows, 0, scene.source)?, look_up(rows, 1, &scene.target)?),
             Pairs::Points(points) => points.iter().map(|&[p, q]| (p, q)).unzip(),
         };
         check_points(&source, Argument::Corr)?;

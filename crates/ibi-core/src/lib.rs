@@ -20,7 +20,6 @@
 //! With the feature `rayon` (default) kernels run on a thread pool of the registrar's own; `serde` makes
 //! parameters and results plain data.
 
-
 mod correspondence;
 mod error;
 mod interrupt;

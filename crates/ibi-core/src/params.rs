@@ -12,7 +12,11 @@ use crate::stages::te::{Gsac, Te};
 
 /// How a registration runs. The default is [`Params::paper_synthetic`] with `t_he_pr` 3.
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct Params {
     /// Key of all random streams. The same seed gives the same bits, for any number of threads.
     pub seed: u64,

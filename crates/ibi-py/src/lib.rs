@@ -8,7 +8,12 @@ use pyo3::create_exception;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 
-create_exception!(ibi_rs, InputError, PyValueError, "An array that cannot be used; the message says which and why.");
+create_exception!(
+    ibi_rs,
+    InputError,
+    PyValueError,
+    "An array that cannot be used; the message says which and why."
+);
 create_exception!(ibi_rs, ParamsError, PyValueError, "A parameter that is unknown or out of range.");
 
 /// The Python exception for an error of the core.

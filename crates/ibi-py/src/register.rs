@@ -141,7 +141,9 @@ fn correspondences(corr: &Bound<'_, PyAny>) -> PyResult<Correspondences> {
         }
         // A negative index wraps to one that is out of range; the core refuses it and reports it as it was.
         let wrap = |index: i64| usize::try_from(index).unwrap_or(index as usize);
-        return Ok(Correspondences::from_rows(rows.rows().into_iter().map(|r| [wrap(r[0]), wrap(r[1])]).collect()));
+        return Ok(Correspondences::from_rows(
+            rows.rows().into_iter().map(|r| [wrap(r[0]), wrap(r[1])]).collect(),
+        ));
     }
     let points: PyReadonlyArray2<'_, f64> = corr.extract()?;
     let points = points.as_array();
@@ -160,13 +162,10 @@ fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyResult<Bound<
         let matrix = p.target_from_source.to_homogeneous().transpose();
         matrix.iter().copied().collect::<Vec<f64>>()
     });
-    let matrices: Bound<'py, PyArray3<f64>> =
-        PyArray1::from_iter(py, rows).reshape([poses.len(), 4, 4])?;
+    let matrices: Bound<'py, PyArray3<f64>> = PyArray1::from_iter(py, rows).reshape([poses.len(), 4, 4])?;
     let column = |f: fn(&ibi_core::Pose) -> f64| PyArray1::from_iter(py, poses.iter().map(f));
-    let inliers: Vec<_> = poses
-        .iter()
-        .map(|p| PyArray1::from_iter(py, p.inliers.iter().map(|&id| i64::from(id))))
-        .collect();
+    let inliers: Vec<_> =
+        poses.iter().map(|p| PyArray1::from_iter(py, p.inliers.iter().map(|&id| i64::from(id)))).collect();
     let labels = registration.labels.iter().map(|label| label.map_or(-1, u32::cast_signed));
     let result = PyDict::new(py);
     result.set_item("target_from_source", matrices)?;

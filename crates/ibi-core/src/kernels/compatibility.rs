@@ -67,14 +67,14 @@ fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
 fn gaussian(a: f32, b: f32, inv_delta_r: f32) -> f32 {
     let u = (a - b) * inv_delta_r;
     let value = exp_neg(u * u);
-    if (a > 0.0) & (b > 0.0) { value } else { 0.0 }
+    if a > 0.0 && b > 0.0 { value } else { 0.0 }
 }
 
 #[inline(always)]
 #[allow(clippy::inline_always)]
 fn ratio(a: f32, b: f32) -> f32 {
     let value = if a < b { a / b } else { b / a };
-    if (a > 0.0) & (b > 0.0) { value } else { 0.0 }
+    if a > 0.0 && b > 0.0 { value } else { 0.0 }
 }
 
 /// Exponents beyond which a payoff or a vote is 0. exp(-32) = 1e-14 is lost in any `f32` sum it could enter, and

@@ -6,7 +6,11 @@ use crate::stages::{Context, Enhance, Ranked};
 /// `voting`: every seed votes for every alive correspondence by their consistency; the `n_vot` with the most
 /// votes are `C_d` (Eq. 5-6; Yang et al. 2019). Seeds are candidates too.
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct Voting {
     /// `N_vot`: size of `C_d`. At least 3.
     pub n_vot: u32,

@@ -5,7 +5,11 @@ use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
 /// `inlier_count`: accepts a pose if more than `t_inliers` alive correspondences have a residual below `t_he`.
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct InlierCount {
     /// The count to exceed; the paper tries 50, 100 and 150. At least 1.
     pub t_inliers: u32,

@@ -9,7 +9,11 @@ use crate::stages::{Context, Hypothesis, Validate, Verdict};
 /// A depth camera sees at most about half of an object, so for scenes from one view the threshold must be
 /// lower, about 0.3 to 0.4.
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct Overlap {
     /// `t_overlap`: the share to exceed. 0 to 1.
     pub t_overlap: f64,

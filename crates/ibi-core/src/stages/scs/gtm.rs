@@ -16,7 +16,11 @@ const MAX_DOWNSAMPLE: u32 = 16_384;
 ///
 /// Memory: 4 `n_downsample`^2 bytes.
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct Gtm {
     /// `N_downsample`: correspondences that play, drawn anew each round. 3 to 16384.
     pub n_downsample: u32,

@@ -4,21 +4,30 @@ use crate::kernels::triplets::TopTriplets;
 use crate::params::{at_least_1, non_negative};
 use crate::stages::{Context, Estimate, EstimatePose, Ranked};
 
-/// `gsac`: guided sampling. The `n_gsac` triplets of `C_d` with the largest sum of votes give a pose each; the
-/// one with the best MAE over the alive correspondences wins (Eq. 7-8).
+/// Triplets looked at, at most, for each one wanted. Votes are alike where correspondences are neighbours, so
+/// the first few hundred triplets may all be thin: where only `n_gsac` were looked at, some rounds had no
+/// hypothesis at all.
+const PATIENCE: usize = 100;
+
+/// `gsac`: guided sampling. The `n_gsac` triplets of `C_d` with the largest sum of votes, thin ones left out,
+/// give a pose each; the one with the best MAE over the alive correspondences wins (Eq. 7-8).
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct Gsac {
     /// `N_gsac`: triplets tried. At least 1.
     pub n_gsac: u32,
     /// Triplets whose points are within this distance of one line, on either side, are skipped and counted,
-    /// in pr. >= 0.
+    /// in pr. >= 0. Noise of one pr turns a thinner triangle by tens of degrees.
     pub min_height_pr: f64,
 }
 
 impl Default for Gsac {
     fn default() -> Self {
-        Self { n_gsac: 100, min_height_pr: 0.1 }
+        Self { n_gsac: 100, min_height_pr: 2.0 }
     }
 }
 
@@ -32,16 +41,25 @@ impl Gsac {
 impl EstimatePose for Gsac {
     fn estimate_pose(&self, context: &Context<'_>, dense: &Ranked) -> Estimate {
         let ids = dense.ids();
+        let wanted = self.n_gsac as usize;
+        let mut triplets = Vec::with_capacity(wanted);
+        let mut num_samples = 0;
         // PAPER: the paper sorts all triplets of C_d, 4,455,100 of them at N_vot = 300.
-        let top = TopTriplets::new(dense.scores()).take(self.n_gsac as usize);
-        let samples: Vec<[u32; 3]> = top.map(|t| t.map(|i| ids[i])).collect();
-        // PAPER: thin triplets are not mentioned; fitted, they turn the model about their line at random.
-        let mut triplets = samples.clone();
-        triplets.retain(|&t| !is_degenerate(context, t, self.min_height_pr));
+        for triplet in TopTriplets::new(dense.scores()).take(wanted.saturating_mul(PATIENCE)) {
+            num_samples += 1;
+            let triplet = triplet.map(|i| ids[i]);
+            // PAPER: thin triplets are not mentioned; fitted, they turn the model about their line at random.
+            if !is_degenerate(context, triplet, self.min_height_pr) {
+                triplets.push(triplet);
+            }
+            if triplets.len() == wanted {
+                break;
+            }
+        }
         Estimate {
             hypothesis: best_of(context, &triplets),
-            num_samples: samples.len() as u32,
-            num_degenerate: (samples.len() - triplets.len()) as u32,
+            num_samples,
+            num_degenerate: num_samples - triplets.len() as u32,
         }
     }
 }

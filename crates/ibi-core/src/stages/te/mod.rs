@@ -37,9 +37,8 @@ impl EstimatePose for Te {
 fn is_degenerate(context: &Context<'_>, ids: [u32; 3], min_height_pr: f64) -> bool {
     let min_height = context.length(min_height_pr);
     let [i, j, k] = ids.map(|id| id as usize);
-    let thin = |points: &[nalgebra::Point3<f64>]| {
-        triangle_height(&points[i], &points[j], &points[k]) <= min_height
-    };
+    let thin =
+        |points: &[nalgebra::Point3<f64>]| triangle_height(&points[i], &points[j], &points[k]) <= min_height;
     thin(&context.pairs.source) || thin(&context.pairs.target)
 }
 

@@ -6,7 +6,11 @@ use crate::stages::{Context, Estimate, EstimatePose, Ranked, Stage};
 /// `ransac`: triplets drawn uniformly from `C_d` give a pose each; the one with the best MAE over the alive
 /// correspondences wins (Fischler & Bolles 1981, scored by Eq. 7-8).
 #[derive(Debug, Clone, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(default, deny_unknown_fields))]
+#[cfg_attr(
+    feature = "serde",
+    derive(serde::Serialize, serde::Deserialize),
+    serde(default, deny_unknown_fields)
+)]
 pub struct Ransac {
     /// Triplets drawn. 1 to 10,000,000.
     pub n_ransac: u32,
@@ -17,7 +21,7 @@ pub struct Ransac {
 
 impl Default for Ransac {
     fn default() -> Self {
-        Self { n_ransac: 1000, min_height_pr: 0.1 }
+        Self { n_ransac: 1000, min_height_pr: 2.0 }
     }
 }
 
