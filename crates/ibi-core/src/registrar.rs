@@ -28,8 +28,8 @@ use crate::state::{Problem, State};
 /// // All of the first instance is matched, and two thirds of the second.
 /// let rows = (0..100).map(|row| [row % 60, row]).collect();
 ///
-/// // A round removes the n_vot best-voted correspondences, so they should be as many as one instance has.
-/// let params = Params { ce: ce::Voting { n_vot: 60 }.into(), ..Params::default() };
+/// // A round removes the n_vot best-voted correspondences, so they should be about as many as one instance has.
+/// let params = Params { ce: ce::Voting { n_vot: 50 }.into(), ..Params::default() };
 /// let found = Registrar::new(&Cloud::from(source.clone()))?
 ///     .params(params)
 ///     .register(&Cloud::from(target), &Correspondences::from_rows(rows))?;

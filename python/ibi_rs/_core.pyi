@@ -1,0 +1,115 @@
+"""The extension module, written in Rust in ``crates/ibi-py``. Users call the faces in front of it."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias, TypedDict
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = [
+    "InputError",
+    "ParamsError",
+    "__version__",
+    "check_params",
+    "metrics_add",
+    "metrics_add_s",
+    "metrics_assignment",
+    "metrics_diameter",
+    "metrics_frobenius_distance",
+    "metrics_mean_score",
+    "metrics_mssd",
+    "metrics_mssd_recall",
+    "metrics_rotation_error_rad",
+    "metrics_score_add_s",
+    "metrics_score_pose",
+    "metrics_translation_error",
+    "params_from_toml",
+    "params_to_toml",
+    "preset",
+    "register",
+]
+
+_Floats: TypeAlias = npt.NDArray[np.float64]
+_Ints: TypeAlias = npt.NDArray[np.int64]
+
+__version__: str
+
+class InputError(ValueError):
+    """An array that cannot be used; the message says which and why."""
+
+class ParamsError(ValueError):
+    """A parameter that is unknown or out of range."""
+
+# Parameters: complete and checked JSON, or TOML, as text.
+
+def preset(name: str) -> str: ...
+def check_params(json: str) -> str: ...
+def params_to_toml(json: str) -> str: ...
+def params_from_toml(text: str) -> str: ...
+
+# Registration.
+
+class _Registration(TypedDict):
+    """One entry per pose, best score first, then what concerns the run; the last four are JSON text."""
+
+    target_from_source: _Floats  # (K, 4, 4)
+    score: _Floats
+    overlap: _Floats
+    inlier_rmse: _Floats
+    inliers: list[_Ints]
+    round: _Ints
+    labels: npt.NDArray[np.int32]  # (M,)
+    resolution: float
+    stop_message: str
+    rounds: str
+    stop_reason: str
+    timings: str
+
+def register(
+    src: _Floats,
+    tgt: _Floats,
+    corr: npt.NDArray[Any],  # (M, 2) int64 or (M, 6) float64
+    params: str,
+    *,
+    src_normals: _Floats | None = None,
+    tgt_normals: _Floats | None = None,
+    similarity: _Floats | None = None,
+    viewpoint: Sequence[float] | None = None,
+    num_threads: int | None = None,
+    on_round: Callable[[str], object] | None = None,
+) -> _Registration: ...
+
+# Metrics.
+
+# ((truth hit, predicted hit), (recall, precision, f1), then one entry per prediction: truth row or -1,
+# rotation error rad, translation error, distance, is hit)
+_Scored: TypeAlias = tuple[
+    tuple[int, int],
+    tuple[float, float, float],
+    _Ints,
+    _Floats,
+    _Floats,
+    _Floats,
+    npt.NDArray[np.bool_],
+]
+
+def metrics_rotation_error_rad(a: _Floats, b: _Floats) -> float: ...
+def metrics_translation_error(a: _Floats, b: _Floats) -> float: ...
+def metrics_frobenius_distance(a: _Floats, b: _Floats) -> float: ...
+def metrics_add(model: _Floats, predicted: _Floats, truth: _Floats) -> float: ...
+def metrics_add_s(model: _Floats, predicted: _Floats, truth: _Floats) -> float: ...
+def metrics_mssd(model: _Floats, predicted: _Floats, truth: _Floats, symmetries: _Floats) -> float: ...
+def metrics_diameter(points: _Floats) -> float: ...
+def metrics_assignment(cost: _Floats) -> _Ints: ...
+def metrics_score_pose(
+    predicted: _Floats, truth: _Floats, matching: str, rotation_rad: float, translation: float
+) -> _Scored: ...
+def metrics_score_add_s(
+    predicted: _Floats, truth: _Floats, matching: str, model: _Floats, diameter_fraction: float
+) -> _Scored: ...
+def metrics_mssd_recall(
+    predicted: _Floats, truth: _Floats, matching: str, model: _Floats, symmetries: _Floats
+) -> tuple[float, _Floats]: ...
+def metrics_mean_score(
+    matching: str, counts: Sequence[tuple[int, int, int, int]]
+) -> tuple[float, float, float]: ...
