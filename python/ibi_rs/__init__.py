@@ -6,7 +6,7 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 from ibi_rs import metrics, synth
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._register import register
-from ibi_rs.params import Gsac, Gtm, InlierCount, None_, Off, Overlap, Params, Ransac, Voting
+from ibi_rs.params import Gsac, Gtm, InlierCount, Irls, LocalGtm, None_, Off, Overlap, Params, Ransac, Voting
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
 
 __all__ = [
@@ -14,6 +14,8 @@ __all__ = [
     "Gtm",
     "InlierCount",
     "InputError",
+    "Irls",
+    "LocalGtm",
     "None_",
     "Off",
     "Overlap",

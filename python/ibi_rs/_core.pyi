@@ -1,7 +1,7 @@
 """The extension module, written in Rust in ``crates/ibi-py``. Users call the faces in front of it."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -49,22 +49,6 @@ def params_from_toml(text: str) -> str: ...
 
 # Registration.
 
-class _Registration(TypedDict):
-    """One entry per pose, best score first, then what concerns the run; the last four are JSON text."""
-
-    target_from_source: _Floats  # (K, 4, 4)
-    score: _Floats
-    overlap: _Floats
-    inlier_rmse: _Floats
-    inliers: list[_Ints]
-    round: _Ints
-    labels: npt.NDArray[np.int32]  # (M,)
-    resolution: float
-    stop_message: str
-    rounds: str
-    stop_reason: str
-    timings: str
-
 def register(
     src: _Floats,
     tgt: _Floats,
@@ -77,7 +61,12 @@ def register(
     viewpoint: Sequence[float] | None = None,
     num_threads: int | None = None,
     on_round: Callable[[str], object] | None = None,
-) -> _Registration: ...
+) -> dict[str, Any]:
+    """Arrays, one entry per pose: target_from_source (K, 4, 4), score, overlap, inlier_rmse, inliers, round.
+
+    Then of the run: labels (M,) int32, resolution and stop_message; and as JSON text rounds, stop_reason and
+    timings.
+    """
 
 # Metrics.
 

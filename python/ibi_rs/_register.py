@@ -17,6 +17,9 @@ from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
 Points = Any
 """(N, 3) real numbers, or an object with ``.points``, ``.vertices`` or ``__array__``."""
 
+_MAX_THREADS = 65535
+"""As many as rayon can tell apart."""
+
 
 def register(
     src: Points,
@@ -72,7 +75,9 @@ def register(
     ParamsError
         A parameter is out of range. A ValueError.
     TypeError
-        An array has a dtype that cannot be used.
+        An array has a dtype that cannot be used, or an argument is of another type than above.
+    ValueError
+        ``num_threads`` or ``IBI_NUM_THREADS`` is no integer from 1 to 65535.
 
     Notes
     -----
@@ -93,6 +98,8 @@ def register(
     params = params if params is not None else Params()
     if not isinstance(params, Params):
         raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be callable, not {type(callback).__name__}")
     overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
     params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
 
@@ -106,9 +113,19 @@ def register(
         similarity=None if similarity is None else _vector("similarity", similarity),
         viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
         num_threads=_num_threads(num_threads),
-        on_round=callback and (lambda text: callback(Round._from_dict(json.loads(text)))),
+        on_round=None if callback is None else _on_round(callback),
     )
     return _registration(raw, params)
+
+
+def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:
+    """Bring a round from the core to the user, and back whether to go on: unless the answer is False."""
+
+    def on_round(text: str) -> bool:
+        answer = callback(Round._from_dict(json.loads(text)))
+        return bool(answer) if isinstance(answer, (bool, np.bool_)) else True
+
+    return on_round
 
 
 def _registration(raw: dict[str, Any], params: Params) -> Registration:
@@ -133,9 +150,15 @@ def _real(name: str, value: Any) -> npt.NDArray[Any]:
         array = np.asarray(value)
     except ValueError as error:  # ragged lists
         raise _core.InputError(f"{name} is not a rectangular array: {error}") from None
-    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+    if array.dtype.kind not in "fiu":  # a timedelta is an np.integer
         raise TypeError(f"{name} has dtype {array.dtype}; it must be real numbers")
     return array
+
+
+def _aligned(array: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
+    """Copy what the core cannot read in place: it takes a field of a packed record for something else."""
+    with np.errstate(over="ignore"):  # of longdouble; the core refuses infinity
+        return np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"])
 
 
 def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
@@ -144,18 +167,18 @@ def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
         for attribute in ("points", "vertices"):
             value = getattr(value, attribute, value)
     array = _real(name, value)
-    if array.size == 0:
+    if array.shape == (0,):
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:
         raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
-    return array.astype(np.float64, copy=False)
+    return _aligned(array, np.float64)
 
 
 def _vector(name: str, value: Any) -> npt.NDArray[np.float64]:
     array = _real(name, value)
     if array.ndim != 1:
         raise _core.InputError(f"{name} has shape {array.shape}; it must be (M,)")
-    return array.astype(np.float64, copy=False)
+    return _aligned(array, np.float64)
 
 
 def _viewpoint(value: Any) -> list[float]:
@@ -167,38 +190,50 @@ def _viewpoint(value: Any) -> list[float]:
 
 def _correspondences(value: Any) -> npt.NDArray[Any]:
     """(M, 2) int64 rows or (M, 6) float64 points."""
-    if isinstance(value, tuple) and len(value) == 2 and all(np.ndim(side) == 2 for side in value):
+    if isinstance(value, (tuple, list)) and len(value) == 2 and all(map(_is_rows3, value)):
         source, target = _points("corr[0]", value[0]), _points("corr[1]", value[1])
         if len(source) != len(target):
-            raise _core.InputError(f"corr is a pair of {len(source)} and {len(target)} points; it must be of equally many")
+            raise _core.InputError(
+                f"corr is a pair of {len(source)} and {len(target)} points; it must be of equally many"
+            )
         return np.hstack([source, target])
     if not isinstance(value, np.ndarray):
-        for attribute in ("correspondence_set",):  # Open3D's RegistrationResult
-            value = getattr(value, attribute, value)
-    array = np.asarray(value) if np.size(value) == 0 else _real("corr", value)
-    if array.size == 0:
+        value = getattr(value, "correspondence_set", value)  # Open3D's RegistrationResult
+    if isinstance(value, (tuple, list, np.ndarray)) and len(value) == 0:  # of any dtype
+        return np.empty((0, 2), np.int64)
+    array = _real("corr", value)
+    if array.shape == (0,):
         return np.empty((0, 2), np.int64)
     if array.ndim != 2 or array.shape[1] not in (2, 6):
         raise _core.InputError(f"corr has shape {array.shape}; it must be (M, 2) rows or (M, 6) points")
     if array.shape[1] == 6:
-        return array.astype(np.float64, copy=False)
+        return _aligned(array, np.float64)
     if not np.issubdtype(array.dtype, np.integer):
         raise TypeError(f"corr of shape (M, 2) has dtype {array.dtype}; rows must be integers")
     # Indices beyond int64 are out of any range; clipped, the core still refuses them and says where.
     if array.dtype == np.uint64:
         array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
-    return array.astype(np.int64, copy=False)
+    return _aligned(array, np.int64)
+
+
+def _is_rows3(side: Any) -> bool:
+    """Whether this is a list of points, of which two make a pair, and not one row of indices."""
+    try:
+        shape = np.shape(side)
+    except ValueError:  # ragged; who reads it next says so
+        return False
+    return len(shape) == 2 and shape[1] == 3
 
 
 def _num_threads(value: int | None) -> int | None:
-    name, given = "num_threads", value
-    if value is None:
-        name, text = "IBI_NUM_THREADS", os.environ.get("IBI_NUM_THREADS", "")
-        if not text:
+    name: str = "num_threads"
+    given: Any = value
+    if given is None:
+        name, given = "IBI_NUM_THREADS", os.environ.get("IBI_NUM_THREADS", "")
+        if not given:
             return None
-        given = int(text) if text.isdecimal() else 0
-        if given < 1:
-            raise ValueError(f"IBI_NUM_THREADS is {text!r}; it must be an integer of at least 1")
-    if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 1:
-        raise ValueError(f"{name} is {given!r}; it must be an integer of at least 1")
+        given = int(given) if given.isdecimal() and len(given) < 10 else given
+    is_integer = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
+    if not is_integer or not 1 <= given <= _MAX_THREADS:
+        raise ValueError(f"{name} is {given!r}; it must be an integer from 1 to {_MAX_THREADS}")
     return int(given)

@@ -13,7 +13,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, get_args
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_type_hints
+
+import numpy as np
 
 from ibi_rs import _core
 
@@ -36,13 +38,45 @@ class Gtm:
 
     References
     ----------
-    Rodola et al., "A Scale Independent Selection Process for 3D Object Recognition in Cluttered Scenes", 2013.
+    Rodola et al., "A Scale Independent Selection Process for 3D Object Recognition in Cluttered Scenes",
+    2013.
     """
 
     variant: ClassVar[str] = "gtm"
     n_downsample: int = 1024
     n_gtm: int = 20
     payoff: Literal["gaussian", "ratio"] = "gaussian"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalGtm:
+    """SCS ``local_gtm``: the game of :class:`Gtm`, played by one neighbourhood at a time.
+
+    The neighbourhoods are those of the sparse second-order compatibility graph of *all* correspondences. One
+    instance cannot be pulled apart by twenty equal ones, as in the global game, and nothing is random.
+
+    Parameters
+    ----------
+    tau_pr
+        Largest rigidity of compatible correspondences, in pr; > 0.
+    min_length_pr
+        Correspondences nearer to each other than this, on either side, say nothing about a pose, in pr; >= 0.
+    normal_tolerance
+        With normals: how far the angles between two oriented points may differ, in cosine; > 0.
+    n_gtm
+        N_gtm: generations of the replicator; at least 1.
+
+    References
+    ----------
+    Chen et al., "SC2-PCR: A Second Order Spatial Compatibility for Efficient and Robust Point Cloud
+    Registration", 2022, for the second order.
+    """
+
+    variant: ClassVar[str] = "local_gtm"
+    tau_pr: float = 1.0
+    min_length_pr: float = 1.0
+    normal_tolerance: float = 0.35
+    n_gtm: int = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +112,7 @@ class Gsac:
     Parameters
     ----------
     n_gsac
-        N_gsac: triplets tried; at least 1.
+        N_gsac: triplets tried; 1 to 1,000,000.
     min_height_pr
         Triplets whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
 
@@ -90,6 +124,20 @@ class Gsac:
     variant: ClassVar[str] = "gsac"
     n_gsac: int = 100
     min_height_pr: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Irls:
+    """TE ``irls``: least squares on the correspondences with the most votes, then on the inliers of the fit.
+
+    Parameters
+    ----------
+    n_refits
+        Fits after the first, to the alive correspondences within 2, 2, 1, 1, ... ``t_he``; 1 to 1000.
+    """
+
+    variant: ClassVar[str] = "irls"
+    n_refits: int = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,16 +168,22 @@ class Overlap:
     Parameters
     ----------
     t_overlap
-        The share to exceed, 0 to 1. A depth camera sees at most about half of an object: for scenes from one
+        The share to exceed, 0 to 1. Of all source points, or of those that face the viewpoint where normals
+        count and there is one. A depth camera sees at most about half of an object: for scenes from one
         view 0.3 to 0.4.
+    exclusive
+        Whether target points that an accepted instance explains support no later one, so that an instance is
+        found once.
 
     References
     ----------
-    Quan et al., "Local Voxelized Structure for 3D Binary Feature Representation and Robust Registration", 2018.
+    Quan et al., "Local Voxelized Structure for 3D Binary Feature Representation and Robust Registration",
+    2018.
     """
 
     variant: ClassVar[str] = "overlap"
     t_overlap: float = 0.85
+    exclusive: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,14 +207,15 @@ class None_:
     variant: ClassVar[str] = "none"
 
 
-Scs = Gtm
+Scs = Gtm | LocalGtm
 Ce = Voting | Off
-Te = Gsac | Ransac
+Te = Gsac | Irls | Ransac
 Hv = Overlap | InlierCount | None_
-Removal = Literal["dense"]
+Refine = Literal["none", "icp"]
+Removal = Literal["dense", "inliers"]
 
 _STAGES: dict[str, tuple[type[Any], ...]] = {
-    "scs": (Gtm,),
+    "scs": get_args(Scs),
     "ce": get_args(Ce),
     "te": get_args(Te),
     "hv": get_args(Hv),
@@ -185,15 +240,23 @@ class Params:
         t_he of Eq. 8: largest residual of an inlier, in pr; > 0.
     d_op_pr
         d_op: largest distance of overlapping points, in pr; > 0.
+    min_normal_cos
+        Least cosine between the normals of an inlier's two points, and of overlapping points, -1 to 1; with a
+        viewpoint, points that face away from it count in no overlap. None leaves normals out of both.
     t_s
         t_s: a run ends when fewer seeds than this are found; at least 3.
     scs, ce, te, hv
         The four stages: seed correspondence selection, correspondence enhancement, transformation estimation,
         hypothesis validation.
+    refine
+        How a hypothesis is polished on the clouds before it is validated: ``"none"``, or ``"icp"``, iterative
+        closest points, point-to-plane where normals count.
     removal
-        Which correspondences a round removes; ``"dense"``: those that the enhancement ranked.
-    max_rounds, max_instances
-        A run ends after so many rounds or instances; None: no limit.
+        Which correspondences a round removes; ``"dense"``: those that the enhancement ranked; ``"inliers"``:
+        those within 2 ``t_he`` of an accepted pose and those whose target point it explains, while the seeds
+        of a rejected one may not lead again.
+    max_rejections, max_rounds, max_instances
+        A run ends after so many rejections in a row, rounds or instances; None: no limit.
     timeout_s
         A run ends after so many seconds and keeps what it has; None: no limit.
 
@@ -218,12 +281,15 @@ class Params:
     delta_r_pr: float = 10.0
     t_he_pr: float = 3.0
     d_op_pr: float = 1.5
+    min_normal_cos: float | None = None
     t_s: int = 5
     scs: Scs = Gtm()
     ce: Ce = Voting()
     te: Te = Gsac()
     hv: Hv = Overlap()
+    refine: Refine = "none"
     removal: Removal = "dense"
+    max_rejections: int | None = None
     max_rounds: int | None = None
     max_instances: int | None = None
     timeout_s: float | None = None
@@ -235,8 +301,8 @@ class Params:
             if isinstance(stage, str):
                 object.__setattr__(self, name, _variant(name, stage)())
             elif not isinstance(stage, variants):
-                allowed = ", ".join(variant.__name__ for variant in variants)
-                raise _core.ParamsError(f"params.{name} is {stage!r}; it must be one of {allowed}")
+                allowed = ", ".join(f"{variant.__name__}()" for variant in variants)
+                raise _core.ParamsError(f"params.{name} is {_shown(stage)}; it must be one of {allowed}")
         # numpy scalars become plain numbers here, so that equality, repr and pickles are those of plain data.
         complete = json.loads(_core.check_params(self._to_json()))
         for name, value in _build(complete).items():
@@ -251,6 +317,16 @@ class Params:
     def paper_real(cls: type[_P]) -> _P:
         """Return the paper's setting for its real data."""
         return cls.from_dict(json.loads(_core.preset("paper_real")))
+
+    @classmethod
+    def single_view(cls: type[_P]) -> _P:
+        """Return the setting for a scene seen by one depth camera.
+
+        Give the normals of both clouds, oriented, and the viewpoint. Not of the paper: all correspondences play,
+        one neighbourhood at a time, and a hypothesis is polished on the clouds before its overlap with the scene
+        points that no other instance explains is measured, over the source points that face the camera.
+        """
+        return cls.from_dict(json.loads(_core.preset("single_view")))
 
     def replace(self: _P, **changes: Any) -> _P:
         """Return a copy with ``changes``; unknown names raise TypeError."""
@@ -268,8 +344,14 @@ class Params:
 
     @classmethod
     def from_dict(cls: type[_P], data: Mapping[str, Any]) -> _P:
-        """Build from nested data; what is missing is defaulted, an unknown key raises ParamsError."""
-        return cls(**_build(json.loads(_core.check_params(_dumps(dict(data))))))
+        """Build from nested data; what is missing is defaulted, an unknown key raises ParamsError.
+
+        A stage is a block that names its ``variant``, or the word alone.
+        """
+        if not isinstance(data, Mapping):
+            raise TypeError(f"params must be a mapping, not {type(data).__name__}")
+        blocks = {name: _block(name, value) if name in _STAGES else value for name, value in data.items()}
+        return cls(**_build(json.loads(_core.check_params(_dumps(blocks)))))
 
     def to_toml(self) -> str:
         """Return the text of a parameter file."""
@@ -290,23 +372,36 @@ class Params:
     def load(cls: type[_P], path: str | os.PathLike[str]) -> _P:
         """Read a parameter file; ``.toml`` or ``.json``."""
         path = Path(path)
-        text = path.read_text(encoding="utf-8")
-        return cls.from_toml(text) if _is_toml(path) else cls.from_dict(json.loads(text))
+        is_toml = _is_toml(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+            return cls.from_toml(text) if is_toml else cls.from_dict(json.loads(text))
+        except ValueError as error:  # of the text, the parameters or the encoding
+            raise _core.ParamsError(f"{path}: {error}") from None
 
     def _to_json(self) -> str:
         return _dumps(self.to_dict())
 
 
-def _variant(stage: str, word: str) -> type[Any]:
-    by_word = {variant.variant: variant for variant in _STAGES[stage]}
-    if word not in by_word:
-        allowed = ", ".join(map(repr, by_word))
-        raise _core.ParamsError(f"params.{stage} is {word!r}; it must be one of {allowed}")
-    return by_word[word]
+def _block(stage: str, value: Any) -> Mapping[str, Any]:
+    """Complete a stage that was given by its word, and see that it names a variant."""
+    block = value if isinstance(value, Mapping) else {"variant": value}
+    if "variant" not in block:
+        raise _core.ParamsError(f"params.{stage} names no variant; add 'variant' to its block")
+    _variant(stage, block["variant"])
+    return block
+
+
+def _variant(stage: str, word: Any) -> type[Any]:
+    for variant in _STAGES[stage]:
+        if variant.variant == word:
+            return variant
+    allowed = ", ".join(repr(variant.variant) for variant in _STAGES[stage])
+    raise _core.ParamsError(f"params.{stage} is {_shown(word)}; it must be one of {allowed}")
 
 
 def _build(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Constructor arguments from complete, checked data."""
+    """Turn complete, checked data into constructor arguments."""
     arguments = dict(data)
     for stage in _STAGES:
         block = dict(arguments[stage])
@@ -315,25 +410,64 @@ def _build(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _dumps(data: Mapping[str, Any]) -> str:
-    for name, value in _leaves(data):
-        if isinstance(value, float) and value - value != 0.0:  # NaN and infinities, which JSON cannot say
-            raise _core.ParamsError(f"params.{name} is {value}; it must be finite")
-    return json.dumps(data, default=_plain)
+    return json.dumps(_plain(data))
 
 
-def _leaves(data: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    out: list[tuple[str, Any]] = []
-    for name, value in data.items():
-        is_block = isinstance(value, Mapping)
-        out += _leaves(value, f"{prefix}{name}.") if is_block else [(f"{prefix}{name}", value)]
+def _plain(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Copy nested data, numpy scalars as plain numbers; refuse what has a wrong type.
+
+    The core would refuse it too, but where its JSON reader stands it no longer knows the parameter's name.
+    Ranges are left to the core, and so are unknown keys.
+    """
+    out: dict[str, Any] = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
+            value = value.item()
+        if name in _HINTS:
+            if allowed := _refusal(name, value):
+                raise _core.ParamsError(f"params.{name} is {_shown(value)}; it must be {allowed}")
+        elif isinstance(value, Mapping):
+            value = _plain(value, f"{name}.")
+        elif name.rpartition(".")[2] != "variant":
+            value = None  # an unknown key, which the core refuses by its name
+        out[str(key)] = value
     return out
 
 
-def _plain(value: Any) -> Any:
-    """Numpy scalars as plain numbers."""
-    if hasattr(value, "item"):
-        return value.item()
-    raise _core.ParamsError(f"params: {value!r} is not a number, a string or a block of these")
+def _shown(value: Any) -> str:
+    """Show a value in part of a line, whatever it is."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:60]}..."
+
+
+_HINTS: dict[str, Any] = {
+    name: hint for name, hint in get_type_hints(Params).items() if name not in _STAGES
+} | {
+    f"{stage}.{name}": hint
+    for stage, variants in _STAGES.items()
+    for variant in variants
+    for name, hint in get_type_hints(variant).items()
+    if name != "variant"
+}
+"""The type of each parameter by its path."""
+
+
+def _refusal(name: str, value: Any) -> str | None:
+    """Say what the value should be; None if its type is right."""
+    kinds = get_args(_HINTS[name]) or (_HINTS[name],)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if value is None and type(None) in kinds:
+        return None
+    if bool in kinds:
+        return None if isinstance(value, bool) else "True or False"
+    if int in kinds:
+        most = 2**64 - 1 if name == "seed" else 2**32 - 1
+        fine = is_number and isinstance(value, int) and 0 <= value <= most
+        return None if fine else f"an integer from 0 to {most}"
+    if float in kinds:  # JSON knows neither NaN nor infinity
+        return None if is_number and -1e300 < value < 1e300 else "a finite number"
+    return None if value in kinds else "one of " + ", ".join(map(repr, kinds))
 
 
 def _is_toml(path: Path) -> bool:

@@ -100,6 +100,8 @@ class Round:
         What validation measured; None if there was no hypothesis.
     num_removed : int
         Correspondences removed at its end.
+    num_barred : int
+        Correspondences barred at its end from leading a seed selection.
     """
 
     index: int
@@ -111,6 +113,7 @@ class Round:
     hypothesis_score: float | None
     verdict: Verdict | None
     num_removed: int
+    num_barred: int
 
     @property
     def accepted(self) -> bool:
@@ -130,8 +133,8 @@ class StopReason:
     Attributes
     ----------
     name : str
-        ``few_seeds``, ``few_correspondences``, ``max_rounds``, ``max_instances``, ``timeout``, ``cancelled``
-        or ``stalled``.
+        ``few_seeds``, ``few_correspondences``, ``max_rejections``, ``max_rounds``, ``max_instances``,
+        ``timeout``, ``cancelled`` or ``stalled``.
     value, threshold : float or None
         The measured number and its limit, where there is one.
     message : str
@@ -155,8 +158,8 @@ class Timings:
     ----------
     prepare_s : float
         Checking the input, kd-trees, resolution.
-    scs_s, ce_s, te_s, hv_s : float
-        The four stages, all rounds.
+    scs_s, ce_s, te_s, refine_s, hv_s : float
+        The four stages and the refinement between the last two, all rounds.
     total_s : float
         From the beginning of the run to its result.
     """
@@ -165,6 +168,7 @@ class Timings:
     scs_s: float
     ce_s: float
     te_s: float
+    refine_s: float
     hv_s: float
     total_s: float
 
@@ -222,7 +226,9 @@ class Registration(Sequence[Pose]):
     def __iter__(self) -> Iterator[Pose]:
         return iter(self.poses)
 
-    def __array__(self, dtype: npt.DTypeLike = None, copy: bool | None = None) -> npt.NDArray[Any]:
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        if copy is False:
+            raise ValueError("the poses are not kept as one array: np.asarray(registration) must copy")
         matrices = [pose.target_from_source for pose in self.poses]
         return np.array(matrices, dtype=dtype or np.float64).reshape(-1, 4, 4)
 

@@ -4,6 +4,7 @@ use nalgebra::Point3;
 
 use crate::error::{Argument, Error};
 use crate::kernels::columns::Columns;
+use crate::kernels::graph::PairNormals;
 use crate::scene::{PreparedCloud, Scene, check_points};
 
 /// Correspondences as a user hands them in: nothing is checked until a [`crate::Registrar`] takes them.
@@ -41,6 +42,23 @@ impl Correspondences {
         self
     }
 
+    /// The normals at both points of each pair; where points are given instead of rows, those of the nearest
+    /// points of the clouds.
+    fn normals(&self, scene: &Scene<'_>) -> Option<PairNormals> {
+        let side = |cloud: &PreparedCloud<'_>, column: usize| {
+            let normals = cloud.normals.as_ref()?;
+            let rows: Vec<usize> = match &self.pairs {
+                Pairs::Rows(rows) => rows.iter().map(|row| row[column]).collect(),
+                Pairs::Points(points) => {
+                    let nearest = |pair: &[Point3<f64>; 2]| cloud.neighbors.nearest(&pair[column]);
+                    points.iter().filter_map(nearest).map(|(row, _)| row as usize).collect()
+                }
+            };
+            Some(rows.into_iter().map(|row| normals[row].cast()).collect())
+        };
+        Some(PairNormals { source: side(scene.source, 0)?, target: side(&scene.target, 1)? })
+    }
+
     /// M, the number of correspondences.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -68,6 +86,8 @@ pub struct PointPairs {
     pub columns: Columns,
     /// How alike the two descriptors of each pair are; larger is better.
     pub similarity: Option<Vec<f64>>,
+    /// Normals at both points of each pair.
+    pub normals: Option<PairNormals>,
 }
 
 impl PointPairs {
@@ -86,7 +106,8 @@ impl PointPairs {
         check_points(&source, Argument::Corr)?;
         check_points(&target, Argument::Corr)?;
         let columns = Columns::new(&source, &target, scene.resolution);
-        Ok(Self { source, target, columns, similarity: given.similarity.clone() })
+        let normals = given.normals(scene);
+        Ok(Self { source, target, columns, similarity: given.similarity.clone(), normals })
     }
 
     /// M, the number of correspondences.

@@ -36,7 +36,7 @@ pub use correspondence::{Alive, Correspondences, PointPairs};
 pub use error::{Argument, Error};
 pub use interrupt::{CancelToken, Interrupt};
 pub use nalgebra;
-pub use params::{Params, Removal};
+pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};
 pub use registration::{Pose, Registration, Round, StopReason, Timings};
 pub use scene::{Cloud, PreparedCloud, Scene};

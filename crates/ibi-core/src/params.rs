@@ -7,8 +7,8 @@ use crate::error::Error;
 use crate::kernels::compatibility::Payoff;
 use crate::stages::ce::{Ce, Voting};
 use crate::stages::hv::{Hv, Overlap};
-use crate::stages::scs::{Gtm, Scs};
-use crate::stages::te::{Gsac, Te};
+use crate::stages::scs::{Gtm, LocalGtm, Scs};
+use crate::stages::te::{Gsac, Irls, Te};
 
 /// How a registration runs. The default is [`Params::paper_synthetic`] with `t_he_pr` 3.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,6 +28,9 @@ pub struct Params {
     pub t_he_pr: f64,
     /// `d_op`: largest distance of overlapping points, in pr. > 0.
     pub d_op_pr: f64,
+    /// Least cosine between the normals of an inlier's two points, and of overlapping points; with a viewpoint,
+    /// points that face away from it count in no overlap. `None` leaves normals out of both. -1 to 1.
+    pub min_normal_cos: Option<f64>,
     /// `t_s`: a run ends when fewer seeds than this are found. At least 3.
     pub t_s: u32,
     /// Seed correspondence selection.
@@ -38,14 +41,31 @@ pub struct Params {
     pub te: Te,
     /// Hypothesis validation.
     pub hv: Hv,
+    /// How a hypothesis is polished on the clouds before it is validated.
+    pub refine: Refine,
     /// Which correspondences a round removes.
     pub removal: Removal,
+    /// A run ends after this many rejections in a row; `None`: no limit.
+    pub max_rejections: Option<u32>,
     /// A run ends after this many rounds; `None`: no limit.
     pub max_rounds: Option<u32>,
     /// A run ends with this many instances; `None`: no limit.
     pub max_instances: Option<u32>,
     /// A run ends after this many seconds and keeps what it has; `None`: no limit. >= 0.
     pub timeout_s: Option<f64>,
+}
+
+/// How a hypothesis is polished on the clouds before it is validated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(rename_all = "snake_case"))]
+#[non_exhaustive]
+pub enum Refine {
+    /// Not at all.
+    #[default]
+    None,
+    /// Iterative closest points within 2 `d_op`: point-to-plane where `min_normal_cos` lets normals count,
+    /// else point-to-point.
+    Icp,
 }
 
 /// Which correspondences a round removes.
@@ -57,6 +77,9 @@ pub enum Removal {
     // PAPER: the text removes C_d after a rejection too; its pseudocode does not, and can loop for ever.
     #[default]
     Dense,
+    /// After an acceptance, the alive correspondences within 2 `t_he` of the pose and those whose target point
+    /// it explains; after a rejection, none, but its seeds may not lead again.
+    Inliers,
 }
 
 impl Default for Params {
@@ -75,12 +98,15 @@ impl Params {
             delta_r_pr: 10.0,
             t_he_pr: 10.0,
             d_op_pr: 1.5,
+            min_normal_cos: None,
             t_s: 5,
             scs: Gtm { n_downsample: 1024, n_gtm: 20, payoff: Payoff::Gaussian }.into(),
             ce: Voting { n_vot: 300 }.into(),
             te: Gsac { n_gsac: 100, ..Gsac::default() }.into(),
-            hv: Overlap { t_overlap: 0.85 }.into(),
+            hv: Overlap { t_overlap: 0.85, exclusive: false }.into(),
+            refine: Refine::None,
             removal: Removal::Dense,
+            max_rejections: None,
             max_rounds: None,
             max_instances: None,
             timeout_s: None,
@@ -94,7 +120,30 @@ impl Params {
             t_he_pr: 1.0,
             d_op_pr: 3.0,
             te: Gsac { n_gsac: 20, ..Gsac::default() }.into(),
-            hv: Overlap { t_overlap: 0.7 }.into(),
+            hv: Overlap { t_overlap: 0.7, exclusive: false }.into(),
+            ..Self::paper_synthetic()
+        }
+    }
+
+    /// For a scene seen by one depth camera. Give the normals of both clouds, oriented, and the viewpoint.
+    ///
+    /// Not of the paper: all correspondences play, one neighbourhood at a time, and a hypothesis is polished on
+    /// the clouds before its overlap with the scene points that no other instance explains is measured, over the
+    /// source points that face the camera.
+    #[must_use]
+    pub fn single_view() -> Self {
+        Self {
+            delta_r_pr: 2.0,
+            t_he_pr: 2.0,
+            d_op_pr: 1.5,
+            min_normal_cos: Some(0.5),
+            t_s: 4,
+            scs: LocalGtm { tau_pr: 2.0, min_length_pr: 2.0, normal_tolerance: 0.3, n_gtm: 20 }.into(),
+            te: Irls::default().into(),
+            refine: Refine::Icp,
+            hv: Overlap { t_overlap: 0.35, exclusive: true }.into(),
+            removal: Removal::Inliers,
+            max_rejections: Some(150),
             ..Self::paper_synthetic()
         }
     }
@@ -108,6 +157,8 @@ impl Params {
         positive("delta_r_pr", self.delta_r_pr)?;
         positive("t_he_pr", self.t_he_pr)?;
         positive("d_op_pr", self.d_op_pr)?;
+        let cos = self.min_normal_cos.unwrap_or(0.0);
+        check("min_normal_cos", cos, (-1.0..=1.0).contains(&cos), "between -1 and 1")?;
         at_least_3("t_s", self.t_s)?;
         let timeout_s = self.timeout_s.unwrap_or(0.0);
         check("timeout_s", timeout_s, (0.0..=1e9).contains(&timeout_s), "between 0 and 1e9 seconds")?;

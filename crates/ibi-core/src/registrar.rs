@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::time::Instant;
 
-use crate::correspondence::{Alive, Correspondences, PointPairs};
+use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
 use crate::kernels::par::Pool;
@@ -166,7 +166,7 @@ impl<'a> Registrar<'a> {
             Ok::<_, Error>((scene, pairs))
         })?;
         let interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
-        Ok(State::new(Problem { alive: Alive::all(&pairs), scene, pairs, interrupt }, pool, start))
+        Ok(State::new(Problem::new(scene, pairs, interrupt), pool, start))
     }
 
     /// Plays rounds until one of them ends the run, or the observer does.
@@ -200,16 +200,38 @@ impl<'a> Registrar<'a> {
                 return ControlFlow::Break(StopReason::FewSeeds { value, threshold });
             }
             let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
-            let estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
+            let mut estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
+            if let Some(hypothesis) = &mut estimate.hypothesis {
+                let pose = &mut hypothesis.target_from_source;
+                *pose = timed(&mut times.refine_s, || context.scene.refined(&self.params, pose));
+            }
             let verdict = estimate
                 .hypothesis
                 .map(|hypothesis| timed(&mut times.hv_s, || self.hv().validate(&context, &hypothesis)));
             state.problem.interrupt.check()?;
 
-            let removed = match self.params.removal {
-                Removal::Dense => dense.ids(),
+            let pose = estimate.hypothesis.filter(|_| verdict.is_some_and(|v| v.accepted()));
+            let (removed, barred) = match (self.params.removal, pose) {
+                (Removal::Dense, _) => (dense.ids().to_vec(), &[][..]),
+                (Removal::Inliers, None) => (Vec::new(), seeds.ids()),
+                // The seeds too are barred: they may all lie outside of the pose that they led to.
+                (Removal::Inliers, Some(hypothesis)) => {
+                    (context.spent(&hypothesis.target_from_source), seeds.ids())
+                }
             };
-            state.conclude(&seeds, &dense, &estimate, verdict, removed)
+            let round = Round {
+                index: context.round,
+                num_alive: context.alive.ids().len() as u32,
+                num_seeds: seeds.len() as u32,
+                num_dense: dense.len() as u32,
+                num_samples: estimate.num_samples,
+                num_degenerate: estimate.num_degenerate,
+                hypothesis_score: estimate.hypothesis.map(|h| h.score),
+                verdict,
+                num_removed: 0,
+                num_barred: 0,
+            };
+            state.conclude(&self.params, round, pose, &removed, barred)
         })
     }
 

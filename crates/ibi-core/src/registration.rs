@@ -66,6 +66,8 @@ pub struct Round {
     pub verdict: Option<Verdict>,
     /// Correspondences removed at its end.
     pub num_removed: u32,
+    /// Correspondences barred at its end from leading a seed selection.
+    pub num_barred: u32,
 }
 
 impl Round {
@@ -95,6 +97,13 @@ pub enum StopReason {
         /// 3.
         threshold: u32,
     },
+    /// `max_rejections` poses in a row were rejected.
+    MaxRejections {
+        /// Rejections in a row.
+        value: u32,
+        /// The limit.
+        threshold: u32,
+    },
     /// `max_rounds` reached.
     MaxRounds {
         /// Rounds played.
@@ -118,7 +127,8 @@ pub enum StopReason {
     },
     /// The observer or the cancel token ended it.
     Cancelled,
-    /// A round removed nothing, so the next would repeat it. Only stages from outside can cause it.
+    /// A round removed and barred nothing, so the next might repeat it for ever. The global game (`gtm`) with
+    /// removal `inliers` can come to this.
     Stalled,
 }
 
@@ -128,6 +138,9 @@ impl std::fmt::Display for StopReason {
             Self::FewSeeds { value, threshold } => write!(f, "few_seeds: {value} seeds, {threshold} needed"),
             Self::FewCorrespondences { value, threshold } => {
                 write!(f, "few_correspondences: {value} alive, {threshold} needed")
+            }
+            Self::MaxRejections { value, threshold } => {
+                write!(f, "max_rejections: {value} of {threshold} in a row")
             }
             Self::MaxRounds { value, threshold } => write!(f, "max_rounds: {value} of {threshold} played"),
             Self::MaxInstances { value, threshold } => {
@@ -155,6 +168,8 @@ pub struct Timings {
     pub ce_s: f64,
     /// Transformation estimation, all rounds.
     pub te_s: f64,
+    /// Refinement of the hypotheses, all rounds.
+    pub refine_s: f64,
     /// Hypothesis validation, all rounds.
     pub hv_s: f64,
     /// Everything from `begin` to the result.

@@ -2,10 +2,15 @@
 
 use std::borrow::Cow;
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 
 use crate::error::{Argument, Error};
+use crate::kernels::icp::icp;
 use crate::kernels::neighbors::Neighbors;
+use crate::kernels::overlap::{Contact, Place, Surface, places};
+use crate::kernels::par;
+use crate::metrics::diameter;
+use crate::params::{Params, Refine};
 
 /// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
 #[derive(Debug, Clone, Default)]
@@ -64,6 +69,8 @@ pub struct PreparedCloud<'a> {
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
     pub extent: f64,
+    /// Largest distance of two points, in data units; of the source only (0 for a target).
+    pub diameter: f64,
 }
 
 impl<'a> PreparedCloud<'a> {
@@ -98,7 +105,14 @@ impl<'a> PreparedCloud<'a> {
             neighbors,
             spacing,
             extent,
+            diameter: if argument == Argument::Src { diameter(points) } else { 0.0 },
         })
+    }
+}
+
+impl PreparedCloud<'_> {
+    fn surface(&self, oriented: bool) -> Surface<'_> {
+        Surface { points: &self.points, normals: self.normals.as_deref().filter(|_| oriented) }
     }
 }
 
@@ -151,6 +165,60 @@ impl<'a> Scene<'a> {
         Ok(Self { source, target, resolution })
     }
 }
+
+impl Scene<'_> {
+    /// Where each source point lies on the target once the pose has moved it, by `d_op` and, if the parameters
+    /// let normals count, by their agreement.
+    #[must_use]
+    pub fn places(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Vec<Place> {
+        let (source, target, contact) = self.surfaces(params, params.d_op_pr);
+        places(&source, &target, &self.target.neighbors, target_from_source, &contact)
+    }
+
+    /// Which of `points` (of the target) lie within `d_op` of the moved source.
+    #[must_use]
+    pub fn explained(
+        &self,
+        params: &Params,
+        target_from_source: &Isometry3<f64>,
+        points: &[Point3<f64>],
+    ) -> Vec<bool> {
+        let d_op = params.d_op_pr * self.resolution;
+        let source_from_target = target_from_source.inverse();
+        let (centre, radius) = (self.source.points[0], self.source.diameter + d_op);
+        par::map(points.len(), 256, |i| {
+            let back = source_from_target * points[i];
+            // Far points need no search: none is farther from the first source point than the diameter.
+            (back - centre).norm_squared() <= radius * radius
+                && self.source.neighbors.nearest(&back).is_some_and(|(_, dist_sq)| dist_sq <= d_op * d_op)
+        })
+    }
+
+    /// The pose polished on the two clouds, as the parameters want it.
+    #[must_use]
+    pub fn refined(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
+        match params.refine {
+            Refine::None => *target_from_source,
+            Refine::Icp => {
+                let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+                icp(&source, &target, &self.target.neighbors, target_from_source, &contact, ICP_STEPS)
+            }
+        }
+    }
+
+    fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact) {
+        let oriented = params.min_normal_cos.is_some();
+        let contact = Contact {
+            distance: distance_pr * self.resolution,
+            min_normal_cos: params.min_normal_cos.unwrap_or(-1.0),
+            viewpoint: self.target.viewpoint,
+        };
+        (self.source.surface(oriented), self.target.surface(oriented), contact)
+    }
+}
+
+/// Steps of a refinement: point-to-plane is done after five or six.
+const ICP_STEPS: u32 = 8;
 
 /// Above this a square is no longer finite in `f64`, whatever it is multiplied with.
 const MAX_COORDINATE: f64 = 1e100;

@@ -1,19 +1,20 @@
 //! A run between two rounds: what is alive, what was found, what happened.
 
 use std::ops::ControlFlow;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use nalgebra::Isometry3;
 
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
+use crate::kernels::graph::Graph;
 use crate::kernels::overlap::overlap;
 use crate::kernels::par::Pool;
 use crate::params::Params;
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
 use crate::scene::Scene;
-use crate::stages::{Context, Estimate, Ranked, Verdict};
+use crate::stages::{Context, Hypothesis};
 
 /// Fewest correspondences that fix a pose.
 const MIN_CORRESPONDENCES: u32 = 3;
@@ -35,6 +36,9 @@ pub(crate) struct Problem<'a> {
     pub(crate) scene: Scene<'a>,
     pub(crate) pairs: PointPairs,
     pub(crate) alive: Alive,
+    pub(crate) barred: Vec<bool>,
+    pub(crate) claimed: Vec<bool>,
+    pub(crate) graph: OnceLock<Graph>,
     pub(crate) interrupt: Interrupt,
 }
 
@@ -45,7 +49,34 @@ struct Found {
     round: u32,
 }
 
-impl Problem<'_> {
+impl<'a> Problem<'a> {
+    pub(crate) fn new(scene: Scene<'a>, pairs: PointPairs, interrupt: Interrupt) -> Self {
+        let (alive, barred) = (Alive::all(&pairs), vec![false; pairs.len()]);
+        let claimed = vec![false; scene.target.points.len()];
+        Self { scene, pairs, alive, barred, claimed, graph: OnceLock::new(), interrupt }
+    }
+
+    /// Takes `ids` out of what is alive; returns how many of them were.
+    fn remove(&mut self, ids: &[u32]) -> u32 {
+        if let Some(graph) = self.graph.get_mut() {
+            graph.remove(ids);
+        }
+        self.alive.remove(ids, &self.pairs) as u32
+    }
+
+    /// Claims the target points within `d_op` of the accepted model.
+    fn claim(&mut self, params: &Params, target_from_source: &Isometry3<f64>) {
+        let explained = self.scene.explained(params, target_from_source, &self.scene.target.points);
+        for (claimed, explained) in self.claimed.iter_mut().zip(explained) {
+            *claimed |= explained;
+        }
+    }
+
+    /// Bars `ids` from leading; returns how many were not barred before.
+    fn bar(&mut self, ids: &[u32]) -> u32 {
+        ids.iter().map(|&id| u32::from(!std::mem::replace(&mut self.barred[id as usize], true))).sum()
+    }
+
     pub(crate) fn context<'c>(&'c self, params: &'c Params, round: usize) -> Context<'c> {
         Context {
             scene: &self.scene,
@@ -53,6 +84,9 @@ impl Problem<'_> {
             alive: &self.alive,
             params,
             round: round as u32,
+            barred: &self.barred,
+            claimed: &self.claimed,
+            graph: &self.graph,
             interrupt: &self.interrupt,
         }
     }
@@ -95,37 +129,35 @@ impl<'a> State<'a> {
         if let Some(threshold) = params.max_instances.filter(|&limit| found >= limit) {
             return ControlFlow::Break(StopReason::MaxInstances { value: found, threshold });
         }
+        let rejections = self.rounds.iter().rev().take_while(|round| !round.accepted()).count() as u32;
+        if let Some(threshold) = params.max_rejections.filter(|&limit| rejections >= limit) {
+            return ControlFlow::Break(StopReason::MaxRejections { value: rejections, threshold });
+        }
         self.problem.interrupt.check()
     }
 
-    /// Books a round: keeps the pose if it was accepted, removes correspondences.
+    /// Books a round: keeps its pose if it was accepted, removes and bars correspondences.
     pub(crate) fn conclude(
         &mut self,
-        seeds: &Ranked,
-        dense: &Ranked,
-        estimate: &Estimate,
-        verdict: Option<Verdict>,
-        remove: &[u32],
+        params: &Params,
+        mut round: Round,
+        accepted: Option<Hypothesis>,
+        removed: &[u32],
+        barred: &[u32],
     ) -> ControlFlow<StopReason, Round> {
-        let num_alive = self.problem.alive.ids().len() as u32;
-        let num_removed = self.problem.alive.remove(remove, &self.problem.pairs) as u32;
-        let round = Round {
-            index: self.rounds.len() as u32,
-            num_alive,
-            num_seeds: seeds.len() as u32,
-            num_dense: dense.len() as u32,
-            num_samples: estimate.num_samples,
-            num_degenerate: estimate.num_degenerate,
-            hypothesis_score: estimate.hypothesis.map(|h| h.score),
-            verdict,
-            num_removed,
-        };
-        if let Some(hypothesis) = estimate.hypothesis.filter(|_| round.accepted()) {
+        let problem = &mut self.problem;
+        round.num_removed = problem.remove(removed);
+        round.num_barred = problem.bar(barred);
+        if let Some(hypothesis) = accepted {
             let target_from_source = hypothesis.target_from_source;
+            problem.claim(params, &target_from_source);
             self.found.push(Found { target_from_source, round: round.index });
         }
         self.rounds.push(round.clone());
-        if num_removed == 0 { ControlFlow::Break(StopReason::Stalled) } else { ControlFlow::Continue(round) }
+        if round.num_removed + round.num_barred == 0 {
+            return ControlFlow::Break(StopReason::Stalled);
+        }
+        ControlFlow::Continue(round)
     }
 
     /// The result: poses measured and ranked, correspondences labelled.
@@ -159,8 +191,7 @@ fn measure(problem: &Problem<'_>, params: &Params, found: &Found) -> (Pose, Vec<
         .filter(|&(_, residual_sq)| residual_sq < t_he * t_he)
         .unzip();
     let mean_sq = residuals_sq.iter().sum::<f64>() / residuals_sq.len().max(1) as f64;
-    let d_op = params.d_op_pr * scene.resolution;
-    let overlap = overlap(&scene.source.points, &scene.target.neighbors, &pose, d_op);
+    let overlap = overlap(&scene.places(params, &pose));
     let pose = Pose {
         target_from_source: pose,
         score: overlap,

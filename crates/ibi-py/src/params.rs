@@ -38,6 +38,7 @@ fn preset(name: &str) -> PyResult<String> {
         "default" => Params::default(),
         "paper_synthetic" => Params::paper_synthetic(),
         "paper_real" => Params::paper_real(),
+        "single_view" => Params::single_view(),
         _ => return Err(ParamsError::new_err(format!("no preset is called {name:?}"))),
     };
     to_json(&params)

@@ -1,8 +1,8 @@
 """Seeded synthetic scenes with known truth, for tests, examples and benchmarks.
 
-`outlier_layout` mixes true pairs with random outliers and needs numpy only; `ecc_layout` matches noisy
-descriptors and needs Open3D (``pip install 'ibi_rs[features]'``). Lengths are in radii of the source shape,
-which lies in the unit sphere. This package imports nothing else of `ibi_rs`.
+`outlier_layout` mixes true pairs with random outliers; `ecc_layout` matches noisy descriptors: your own, or
+FPFH, for which it needs Open3D (``pip install 'ibi_rs[features]'``). Lengths are in radii of the source
+shape, which lies in the unit sphere. This package imports nothing else of `ibi_rs`.
 
 Examples
 --------

@@ -9,8 +9,9 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -141,6 +142,7 @@ def ecc_layout(
     seed: int,
     *,
     shapes: Mapping[str, tuple[Array, Array | None]] | str | Path | None = None,
+    descriptors: Callable[[Array, Array | None], NDArray[Any]] | None = None,
     descriptor_noise: float = 0.02,
     jitter: float = 0.01,
     num_objects: int = 20,
@@ -176,8 +178,12 @@ def ecc_layout(
         Name -> (points, normals or None) of dense clouds, or a folder of PLY meshes (see `sample_mesh`; the
         repository's ``examples/models`` is one), or None: the built-in shapes. None does not look for files,
         so that a seed means one scene wherever the package is installed.
+    descriptors : callable or None
+        ``descriptors(points, normals)`` of a dense cloud within the unit sphere, (n, 3) and (n, 3) or None
+        where the shape has no normals, gives an (n, D) array of finite numbers: learned descriptors, for
+        instance. It must not depend on chance if a seed is to mean one scene. None: the FPFH above, D = 99.
     descriptor_noise : float
-        Standard deviation of the noise on each of the 99 descriptor entries.
+        Standard deviation of the noise on each descriptor entry.
     jitter : float
         Standard deviation of the noise per coordinate, in shape radii, clipped at 0.05, on source and objects
         alike.
@@ -195,9 +201,10 @@ def ecc_layout(
     Raises
     ------
     ImportError
-        If Open3D is not installed; the message names the extra that brings it.
+        If `descriptors` is None and Open3D is not installed; the message names the extra that brings it.
     ValueError
-        If an argument is out of range or a shape has fewer than `num_points` points.
+        If an argument is out of range, a shape has fewer than `num_points` points, or `descriptors` gives no
+        (n, D) array of finite numbers.
 
     References
     ----------
@@ -209,7 +216,9 @@ def ecc_layout(
     Examples
     --------
     >>> from ibi_rs import synth
-    >>> scene = synth.ecc_layout(3, shapes="examples/models")  # doctest: +SKIP
+    >>> scene = synth.ecc_layout(3, descriptors=lambda points, normals: points, num_objects=4)
+    >>> scene.corr.shape, scene.similarity.shape
+    ((2024, 2), (2024,))
     """
     if descriptor_noise < 0 or jitter < 0 or num_objects < 1 or num_points < 2 or num_clutter < 0:
         raise ValueError("noise, jitter and num_clutter must be at least 0, num_objects 1 and num_points 2")
@@ -221,6 +230,8 @@ def ecc_layout(
     source_class = int(draw.choice(np.unique(object_class)))
 
     dense = {c: loaders[names[c]]() for c in np.unique(object_class).tolist()}
+    describe = dense_descriptors if descriptors is None else descriptors
+    dense_described: dict[int, NDArray[Any]] = {}
     points_rng, noise_rng = _rng(seed, _ECC, _POINTS), _rng(seed, _ECC, _MATCHES)
 
     def sample(c: int) -> tuple[Array, Array]:
@@ -230,21 +241,23 @@ def ecc_layout(
                 f"shape {names[c]!r} has {len(points)} points, fewer than num_points = {num_points}"
             )
         rows = points_rng.choice(len(points), num_points, replace=False)
-        described = dense_descriptors(points, normals)[rows]
+        if c not in dense_described:
+            dense_described[c] = _checked_descriptors(describe(points, normals), len(points))
+        described = dense_described[c][rows]
         noise = noise_rng.normal(0, descriptor_noise, described.shape)
         return points[rows] + _jitter((num_points, 3), jitter, points_rng), described + noise
 
-    src, src_descriptors = sample(source_class)
+    src, src_described = sample(source_class)
     poses = _poses(num_objects, _rng(seed, _ECC, _POSES), 0.0)
-    objects, descriptors = [], []
+    objects, objects_described = [], []
     for pose, c in zip(poses, object_class.tolist(), strict=True):
         points, described = sample(c)
         objects.append(move(pose, points))
-        descriptors.append(described)
+        objects_described.append(described)
     clutter_rng = _rng(seed, _ECC, _CLUTTER)
     tgt = np.vstack([*objects, clutter_rng.uniform(0, _CLUTTER_SIDE, (num_clutter, 3))])
 
-    rows, similarity = nearest(np.vstack(descriptors), src_descriptors)
+    rows, similarity = nearest(np.vstack(objects_described), src_described)
     rows = np.concatenate([rows, clutter_rng.integers(len(src), size=num_clutter)])
     similarity = np.concatenate([similarity, clutter_rng.choice(similarity, num_clutter)])
     order = _rng(seed, _ECC, _SHUFFLE).permutation(len(tgt))
@@ -255,6 +268,18 @@ def ecc_layout(
 
 def _rng(seed: int, *keys: int) -> np.random.Generator:
     return np.random.default_rng([seed, *keys])
+
+
+def _checked_descriptors(value: Any, num_points: int) -> NDArray[Any]:
+    described: NDArray[Any] = np.asarray(value)
+    if described.ndim != 2 or len(described) != num_points or described.dtype.kind not in "fiu":
+        raise ValueError(
+            f"descriptors gave shape {described.shape} of {described.dtype}; "
+            f"it must be ({num_points}, D) real numbers"
+        )
+    if not np.isfinite(described).all():
+        raise ValueError("descriptors gave numbers that are not finite")
+    return described
 
 
 def _range(name: str, value: int | tuple[int, int]) -> tuple[int, int]:

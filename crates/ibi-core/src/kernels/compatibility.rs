@@ -27,11 +27,19 @@ pub enum Payoff {
 /// # Complexity
 /// O(n^2) time, 4 n^2 bytes.
 #[must_use]
-pub fn payoff_matrix(pairs: &Columns, payoff: Payoff, delta_r: f64) -> Vec<f32> {
+pub fn payoff_matrix(
+    pairs: &Columns,
+    payoff: Payoff,
+    delta_r: f64,
+    interrupted: impl Fn() -> bool + Sync,
+) -> Vec<f32> {
     let n = pairs.len();
     let inv = 1.0 / delta_r as f32;
     let mut matrix = vec![0.0; n * n];
     par::for_rows(&mut matrix, n, GRAIN, |i, row| {
+        if interrupted() {
+            return;
+        }
         let (p, q) = pairs.pair(i);
         match payoff {
             Payoff::Gaussian => pairs.map_into(row, |pj, qj| gaussian(distance(p, pj), distance(q, qj), inv)),
@@ -85,17 +93,39 @@ const NEGLIGIBLE: f32 = 32.0;
 /// exp(-x) for x >= 0, to 3e-7 relative; 0 where x > [`NEGLIGIBLE`].
 ///
 /// The library's `expf` is a call per element and keeps the loops above from vectorising. This is the
-/// textbook reduction exp(-x) = 2^k 2^f with |f| <= 1/2, and the Taylor polynomial of 2^f.
+/// textbook reduction exp(-x) = 2^k e^f with |f| <= ln(2) / 2, and the Taylor polynomial of e^f; ln(2) comes in
+/// two parts, the first of few bits, so that k ln(2) is exact (Cody & Waite 1980).
 #[inline(always)]
 #[allow(clippy::inline_always)]
 fn exp_neg(x: f32) -> f32 {
     // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits of the mantissa.
     const ROUND: f32 = 12_582_912.0;
-    let y = x.min(NEGLIGIBLE) * -std::f32::consts::LOG2_E;
-    let shifted = y + ROUND;
-    let f = (y - (shifted - ROUND)) * std::f32::consts::LN_2;
+    const LN_2_HIGH: f32 = 355.0 / 512.0;
+    const LN_2_LOW: f32 = -2.121_944_4e-4;
+    let y = -x.min(NEGLIGIBLE);
+    let shifted = y * std::f32::consts::LOG2_E + ROUND;
+    let k = shifted - ROUND;
+    let f = (y - k * LN_2_HIGH) - k * LN_2_LOW;
     let poly = 1.0
         + f * (1.0 + f * (0.5 + f * (1.0 / 6.0 + f * (1.0 / 24.0 + f * (1.0 / 120.0 + f * (1.0 / 720.0))))));
     let power = f32::from_bits(shifted.to_bits().wrapping_add(127) << 23);
     if x > NEGLIGIBLE { 0.0 } else { poly * power }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{NEGLIGIBLE, exp_neg};
+
+    // Here and not in tests/: the function is private, and a matrix shows its error only on distances.
+    #[test]
+    fn exp_neg_is_accurate_and_0_beyond_the_cut() {
+        let steps = 1_000_000;
+        for x in (0..=steps).map(|i| i as f32 * (NEGLIGIBLE / steps as f32)) {
+            let (value, exact) = (f64::from(exp_neg(x)), (-f64::from(x)).exp());
+            assert!((value / exact - 1.0).abs() < 3e-7, "{value} at {x}");
+        }
+        for x in [NEGLIGIBLE.next_up(), 33.0, 1e4, f32::MAX, f32::INFINITY] {
+            assert_eq!(exp_neg(x).to_bits(), 0);
+        }
+    }
 }

@@ -16,19 +16,19 @@ pub fn mae(pairs: &Columns, target_from_source: &Isometry3<f64>, t_he: f64) -> f
     pairs.sum(|p, q| (1.0 - residual_sq(p, q).sqrt() * inv).max(0.0))
 }
 
-/// Pairs with |T p - q| < `t_he`, in the unit of the columns.
+/// Rows of the pairs with |T p - q| < `t_he`, ascending; `t_he` in the unit of the columns.
 ///
 /// # Complexity
 /// O(pairs).
 #[must_use]
-pub fn count_inliers(pairs: &Columns, target_from_source: &Isometry3<f64>, t_he: f64) -> usize {
+pub fn close_pairs(pairs: &Columns, target_from_source: &Isometry3<f64>, t_he: f64) -> Vec<u32> {
     let residual_sq = residual_sq(pairs, target_from_source);
     let t_he_sq = (t_he * t_he) as f32;
-    let is_inlier = |i: &usize| {
-        let (p, q) = pairs.pair(*i);
+    let is_close = |i: &u32| {
+        let (p, q) = pairs.pair(*i as usize);
         residual_sq(p, q) < t_he_sq
     };
-    (0..pairs.len()).filter(is_inlier).count()
+    (0..pairs.len() as u32).filter(is_close).collect()
 }
 
 /// |T p - q|^2 as a function of (p, q), in the frame and unit of the columns.

@@ -5,6 +5,9 @@
 
 pub mod columns;
 pub mod compatibility;
+pub mod graph;
+pub mod grid;
+pub mod icp;
 pub mod kabsch;
 pub mod mae;
 pub mod neighbors;

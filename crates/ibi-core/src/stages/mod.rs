@@ -8,10 +8,14 @@ pub mod hv;
 pub mod scs;
 pub mod te;
 
+use std::sync::OnceLock;
+
 use nalgebra::Isometry3;
 
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
+use crate::kernels::graph::Graph;
+use crate::kernels::mae::close_pairs;
 use crate::kernels::rng::Rng;
 use crate::params::Params;
 use crate::scene::Scene;
@@ -53,6 +57,12 @@ pub struct Context<'a> {
     pub params: &'a Params,
     /// Number of the round, from 0.
     pub round: u32,
+    /// Correspondences that may not lead a seed selection again: seeds of rejected poses. By id.
+    pub barred: &'a [bool],
+    /// Target rows that an accepted instance explains.
+    pub claimed: &'a [bool],
+    /// The compatibility graph of all correspondences, built by the first stage that wants it.
+    pub graph: &'a OnceLock<Graph>,
     /// Asked by long computations, which may then return anything: the round is thrown away.
     pub interrupt: &'a Interrupt,
 }
@@ -62,6 +72,35 @@ impl Context<'_> {
     #[must_use]
     pub fn length(&self, length_pr: f64) -> f64 {
         length_pr * self.scene.resolution
+    }
+
+    /// Alive correspondences with |T p - q| below `distance_pr`, ascending; with normals that count, those of
+    /// both points must agree as well.
+    #[must_use]
+    pub fn inliers(&self, target_from_source: &Isometry3<f64>, distance_pr: f64) -> Vec<u32> {
+        let ids = self.alive.ids();
+        let close = close_pairs(self.alive.columns(), target_from_source, distance_pr);
+        let close = close.into_iter().map(|row| ids[row as usize]);
+        match (&self.pairs.normals, self.params.min_normal_cos) {
+            (Some(normals), Some(min_cos)) => {
+                close.filter(|&id| normals.agree(id, target_from_source, min_cos)).collect()
+            }
+            _ => close.collect(),
+        }
+    }
+
+    /// Alive correspondences that an accepted pose uses up: its inliers within 2 `t_he`, and those, right or
+    /// wrong, whose target point it explains.
+    #[must_use]
+    pub fn spent(&self, target_from_source: &Isometry3<f64>) -> Vec<u32> {
+        let ids = self.alive.ids();
+        let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
+        let explained = self.scene.explained(self.params, target_from_source, &targets);
+        let mut spent = self.inliers(target_from_source, 2.0 * self.params.t_he_pr);
+        spent.extend(ids.iter().zip(explained).filter(|&(_, yes)| yes).map(|(&id, _)| id));
+        spent.sort_unstable();
+        spent.dedup();
+        spent
     }
 
     /// The random stream of `stage` in this round, and no other's.

@@ -1,5 +1,4 @@
 use crate::error::Error;
-use crate::kernels::mae::count_inliers;
 use crate::params::at_least_1;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
@@ -29,8 +28,7 @@ impl InlierCount {
 
 impl Validate for InlierCount {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        let pose = &hypothesis.target_from_source;
-        let count = count_inliers(context.alive.columns(), pose, context.params.t_he_pr);
-        Verdict { value: count as f64, threshold: self.t_inliers.into() }
+        let inliers = context.inliers(&hypothesis.target_from_source, context.params.t_he_pr);
+        Verdict { value: inliers.len() as f64, threshold: self.t_inliers.into() }
     }
 }

@@ -1,5 +1,5 @@
 use crate::error::Error;
-use crate::kernels::overlap::overlap;
+use crate::kernels::overlap::{Place, overlap};
 use crate::params::share;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
@@ -17,11 +17,14 @@ use crate::stages::{Context, Hypothesis, Validate, Verdict};
 pub struct Overlap {
     /// `t_overlap`: the share to exceed. 0 to 1.
     pub t_overlap: f64,
+    /// Whether target points that an accepted instance explains support no later one, so that an instance is
+    /// found once.
+    pub exclusive: bool,
 }
 
 impl Default for Overlap {
     fn default() -> Self {
-        Self { t_overlap: 0.85 }
+        Self { t_overlap: 0.85, exclusive: false }
     }
 }
 
@@ -33,13 +36,14 @@ impl Overlap {
 
 impl Validate for Overlap {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        let scene = context.scene;
-        let value = overlap(
-            &scene.source.points,
-            &scene.target.neighbors,
-            &hypothesis.target_from_source,
-            context.length(context.params.d_op_pr),
-        );
-        Verdict { value, threshold: self.t_overlap }
+        let mut places = context.scene.places(context.params, &hypothesis.target_from_source);
+        if self.exclusive {
+            for place in &mut places {
+                if matches!(place, Place::On(row) if context.claimed[*row as usize]) {
+                    *place = Place::Free;
+                }
+            }
+        }
+        Verdict { value: overlap(&places), threshold: self.t_overlap }
     }
 }

@@ -6,7 +6,7 @@ use crate::params::{at_least_1, at_least_3, at_most};
 use crate::stages::{Context, Ranked, SelectSeeds, Stage};
 
 /// Bins of the histogram in which Otsu's threshold is searched.
-const OTSU_BINS: usize = 100;
+pub(super) const OTSU_BINS: usize = 100;
 
 /// Largest sample: its payoff matrix takes 1 GiB.
 const MAX_DOWNSAMPLE: u32 = 16_384;
@@ -50,11 +50,13 @@ impl SelectSeeds for Gtm {
         // that the order of the input does not matter.
         let sample = context.rng(Stage::Scs).sample(context.alive.ids(), self.n_downsample as usize);
         let players = context.pairs.columns.gather(&sample);
-        let payoff = payoff_matrix(&players, self.payoff, context.params.delta_r_pr);
+        let payoff =
+            payoff_matrix(&players, self.payoff, context.params.delta_r_pr, || context.interrupt.is_set());
         let generations = self.n_gtm as usize;
         let population = replicator(&payoff, sample.len(), generations, || context.interrupt.is_set());
         let Some(population) = population else { return Ranked::default() };
-        let Some(t_gtm) = otsu(&population, OTSU_BINS) else { return Ranked::default() };
+        // Equal shares have no threshold: nothing is to be told apart, so all are seeds.
+        let t_gtm = otsu(&population, OTSU_BINS).unwrap_or(0.0);
         Ranked::new(sample.into_iter().zip(population).filter(|&(_, x)| x > t_gtm).collect())
     }
 }

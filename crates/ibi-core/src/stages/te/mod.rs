@@ -1,9 +1,11 @@
 //! TE, transformation estimation: `C_d` -> one pose hypothesis.
 
 mod gsac;
+mod irls;
 mod ransac;
 
 pub use gsac::Gsac;
+pub use irls::Irls;
 pub use ransac::Ransac;
 
 use nalgebra::Isometry3;
@@ -18,6 +20,8 @@ variants! {
     Te {
         /// Guided sampling: the triplets with the most votes.
         Gsac = "gsac",
+        /// Least squares, re-weighted.
+        Irls = "irls",
         /// Uniform sampling.
         Ransac = "ransac",
     }
@@ -27,6 +31,7 @@ impl EstimatePose for Te {
     fn estimate_pose(&self, context: &Context<'_>, dense: &Ranked) -> Estimate {
         match self {
             Self::Gsac(gsac) => gsac.estimate_pose(context, dense),
+            Self::Irls(irls) => irls.estimate_pose(context, dense),
             Self::Ransac(ransac) => ransac.estimate_pose(context, dense),
         }
     }

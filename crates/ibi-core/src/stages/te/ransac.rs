@@ -39,9 +39,16 @@ impl EstimatePose for Ransac {
             return Estimate::default();
         }
         let mut rng = context.rng(Stage::Te);
-        let mut triplets: Vec<[u32; 3]> =
-            (0..self.n_ransac).map(|_| three_of(dense.ids(), || rng.below(dense.len()))).collect();
-        triplets.retain(|&t| !is_degenerate(context, t, self.min_height_pr));
+        let mut triplets = Vec::new();
+        for sample in 0..self.n_ransac {
+            if sample % 4096 == 0 && context.interrupt.is_set() {
+                return Estimate::default();
+            }
+            let triplet = three_of(dense.ids(), || rng.below(dense.len()));
+            if !is_degenerate(context, triplet, self.min_height_pr) {
+                triplets.push(triplet);
+            }
+        }
         Estimate {
             hypothesis: best_of(context, &triplets),
             num_samples: self.n_ransac,

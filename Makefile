@@ -1,0 +1,102 @@
+# Each target sets up what it needs in .venv, beside this file. Nothing is installed anywhere else.
+# Stamp files in .venv/stamps remember what was done, so that a second run is quick.
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+
+PYTHON ?= python3
+VENV := .venv
+STAMPS := $(VENV)/stamps
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# What the extension module is built from. The Python package is installed editable and needs no rebuild.
+SOURCES := Cargo.toml Cargo.lock pyproject.toml \
+	$(shell find crates/ibi-core crates/ibi-py -name '*.rs' -path '*/src/*' -o -name Cargo.toml)
+
+# Where rustup puts cargo, for shells that have not read its profile yet.
+export PATH := $(PATH):$(HOME)/.cargo/bin
+# maturin installs into this environment, whichever one the caller has activated.
+export VIRTUAL_ENV := $(CURDIR)/$(VENV)
+unexport CONDA_PREFIX PYTHONHOME
+
+.PHONY: help
+help: ## list the targets
+	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+.PHONY: demo
+demo: $(STAMPS)/package $(STAMPS)/group-demo ## register the example scenes and draw what was found
+	$(BIN)/python examples/demo.py
+
+.PHONY: test
+test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and Python
+	cargo test --workspace --exclude ibi-py --all-features
+	$(BIN)/python -m pytest
+
+.PHONY: bench
+bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac picks some
+	cargo bench -p ibi-core --bench '*' -- $(ARGS)
+
+.PHONY: tables
+tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables and write benchmarks/records (needs Open3D)
+	$(BIN)/python benchmarks/symmetry.py examples/models
+	$(BIN)/python benchmarks/ecc_layout.py
+
+.PHONY: lint
+lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets --all-features -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc -p ibi-core --no-deps --all-features
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m mypy.stubtest ibi_rs._core
+
+.PHONY: docs
+docs: $(STAMPS)/package $(STAMPS)/group-docs ## build the documentation into docs/_build
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build
+	@echo "open docs/_build/index.html"
+
+.PHONY: wheel
+wheel: cargo $(STAMPS)/venv ## build a wheel into dist
+	$(BIN)/maturin build --release --out dist
+
+.PHONY: clean
+clean: ## remove all that make has made
+	rm -rf $(VENV) target dist docs/_build .pytest_cache .mypy_cache .ruff_cache
+	rm -f python/ibi_rs/_core*.so python/ibi_rs/_core*.pyd
+	find python tests benchmarks examples docs -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# What the targets need ------------------------------------------------------------------------------------
+
+.PHONY: cargo
+cargo:
+	@command -v cargo >/dev/null || { echo "make: cargo is missing; install Rust 1.89 or newer (https://rustup.rs)" >&2; exit 1; }
+
+$(STAMPS)/venv:
+	@command -v "$(PYTHON)" >/dev/null || { \
+		echo "make: $(PYTHON) is missing; install Python 3.10 or newer, or name one: make PYTHON=python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+		echo "make: $(PYTHON) is $$("$(PYTHON)" -V), and 3.10 or newer is needed; name one: make PYTHON=python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+		echo "make: $(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv" >&2; exit 1; }
+	"$(PYTHON)" -m venv $(VENV)
+	$(PIP) --upgrade "pip>=25.1" "maturin>=1.9,<2"
+	@mkdir -p $(STAMPS) && touch $@
+
+# The package, in release, editable.
+$(STAMPS)/package: $(STAMPS)/venv $(SOURCES) | cargo
+	$(BIN)/maturin develop --release
+	@touch $@
+
+# One of the [dependency-groups] of pyproject.toml.
+$(STAMPS)/group-%: $(STAMPS)/venv pyproject.toml
+	$(PIP) --group $*
+	@touch $@
+
+$(STAMPS)/open3d: $(STAMPS)/group-bench
+	@$(BIN)/python -c 'import open3d' || { \
+		echo "make: Open3D cannot be loaded; on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1" >&2; exit 1; }
+	@touch $@

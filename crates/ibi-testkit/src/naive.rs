@@ -1,0 +1,180 @@
+//! The kernels once more, in `f64`, written as their definitions read: no lanes, no trees, no early exits.
+
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+
+/// One correspondence: (source point, target point).
+pub type Pair = (Point3<f64>, Point3<f64>);
+
+/// The payoff of two correspondences.
+#[derive(Debug, Clone, Copy)]
+pub enum Payoff {
+    /// exp(-r^2 / `delta_r`^2).
+    Gaussian {
+        /// Width, in data units.
+        delta_r: f64,
+    },
+    /// min(a/b, b/a).
+    Ratio,
+}
+
+/// The payoff of i and j; 0 where they share a point.
+#[must_use]
+pub fn payoff(i: &Pair, j: &Pair, payoff: Payoff) -> f64 {
+    let (a, b) = ((i.0 - j.0).norm(), (i.1 - j.1).norm());
+    if a == 0.0 || b == 0.0 {
+        return 0.0;
+    }
+    match payoff {
+        Payoff::Gaussian { delta_r } => (-((a - b) / delta_r).powi(2)).exp(),
+        Payoff::Ratio => (a / b).min(b / a),
+    }
+}
+
+/// All payoffs, row-major n x n.
+#[must_use]
+pub fn payoff_matrix(pairs: &[Pair], kind: Payoff) -> Vec<f64> {
+    pairs.iter().flat_map(|i| pairs.iter().map(|j| payoff(i, j, kind))).collect()
+}
+
+/// For each candidate the sum of the voters' gaussian payoffs.
+#[must_use]
+pub fn votes(candidates: &[Pair], voters: &[Pair], delta_r: f64) -> Vec<f64> {
+    let votes = |c| voters.iter().map(|v| payoff(c, v, Payoff::Gaussian { delta_r })).sum();
+    candidates.iter().map(votes).collect()
+}
+
+/// `steps` synchronous generations from the uniform population; `None` once nobody gains anything.
+#[must_use]
+pub fn replicator(payoff: &[f64], n: usize, steps: usize) -> Option<Vec<f64>> {
+    let mut x = vec![1.0 / n as f64; n];
+    for _ in 0..steps {
+        let gain: Vec<f64> = (0..n).map(|i| (0..n).map(|j| payoff[i * n + j] * x[j]).sum()).collect();
+        let mean: f64 = (0..n).map(|i| x[i] * gain[i]).sum();
+        if mean == 0.0 {
+            return None;
+        }
+        x = (0..n).map(|i| x[i] * gain[i] / mean).collect();
+    }
+    Some(x)
+}
+
+/// The bin of `value` in a histogram of `bins` bins over 0..=max.
+fn bin(value: f32, max: f64, bins: usize) -> usize {
+    ((f64::from(value) / max * bins as f64) as usize).min(bins - 1)
+}
+
+/// Otsu's criterion for the split "bins below `edge`, bins from `edge` on", counted afresh; `None` if a class
+/// is empty.
+#[must_use]
+pub fn between_class_variance(values: &[f32], bins: usize, edge: usize) -> Option<f64> {
+    let max = values.iter().copied().fold(0.0, f32::max).into();
+    let (lower, upper): (Vec<usize>, Vec<usize>) =
+        values.iter().map(|&v| bin(v, max, bins)).partition(|&b| b < edge);
+    let mean = |class: &[usize]| class.iter().sum::<usize>() as f64 / class.len() as f64;
+    let (n, m) = (lower.len() as f64, upper.len() as f64);
+    (n * m > 0.0).then(|| n * m * (mean(&lower) - mean(&upper)).powi(2))
+}
+
+/// The first bin edge (as a number of bins) of largest between-class variance, by trying them all.
+#[must_use]
+pub fn otsu_edge(values: &[f32], bins: usize) -> Option<usize> {
+    let mut best: Option<(f64, usize)> = None;
+    for edge in 1..bins {
+        if let Some(variance) = between_class_variance(values, bins, edge)
+            && best.is_none_or(|(top, _)| variance > top)
+        {
+            best = Some((variance, edge));
+        }
+    }
+    best.map(|(_, edge)| edge)
+}
+
+/// All triplets i < j < k, largest sum of scores first, ties in lexicographic order.
+#[must_use]
+pub fn top_triplets(scores: &[f32]) -> Vec<[usize; 3]> {
+    let n = scores.len();
+    let mut all: Vec<[usize; 3]> =
+        (0..n).flat_map(|i| (i + 1..n).flat_map(move |j| (j + 1..n).map(move |k| [i, j, k]))).collect();
+    let sum = |t: &[usize; 3]| scores[t[0]] + scores[t[1]] + scores[t[2]];
+    all.sort_by(|a, b| sum(b).total_cmp(&sum(a)).then(a.cmp(b)));
+    all
+}
+
+/// |T p - q| of each pair.
+#[must_use]
+pub fn residuals(pairs: &[Pair], pose: &Isometry3<f64>) -> Vec<f64> {
+    pairs.iter().map(|(p, q)| (pose * p - q).norm()).collect()
+}
+
+/// sum of (`t_he` - e) / `t_he` over the residuals e below `t_he`.
+#[must_use]
+pub fn mae(pairs: &[Pair], pose: &Isometry3<f64>, t_he: f64) -> f64 {
+    residuals(pairs, pose).iter().filter(|&&e| e < t_he).map(|e| (t_he - e) / t_he).sum()
+}
+
+/// Rows of the pairs with a residual below `t_he`, ascending.
+#[must_use]
+pub fn close_pairs(pairs: &[Pair], pose: &Isometry3<f64>, t_he: f64) -> Vec<u32> {
+    let residuals = residuals(pairs, pose);
+    (0..pairs.len() as u32).filter(|&row| residuals[row as usize] < t_he).collect()
+}
+
+/// The squared distance to the nearest of `points`; infinite for none.
+#[must_use]
+pub fn nearest_dist_sq(points: &[Point3<f64>], query: &Point3<f64>) -> f64 {
+    points.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min)
+}
+
+/// Mean distance of a point to the nearest other one; 0 for fewer than two.
+#[must_use]
+pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
+    if points.len() < 2 {
+        return 0.0;
+    }
+    let nearest_other = |i: usize| {
+        let others = points.iter().enumerate().filter(|&(j, _)| j != i);
+        others.map(|(_, p)| (p - points[i]).norm()).fold(f64::INFINITY, f64::min)
+    };
+    (0..points.len()).map(nearest_other).sum::<f64>() / points.len() as f64
+}
+
+/// Share of the moved source points with a target point within `d_op`.
+#[must_use]
+pub fn overlap(source: &[Point3<f64>], target: &[Point3<f64>], pose: &Isometry3<f64>, d_op: f64) -> f64 {
+    let close = |p: &&Point3<f64>| target.iter().any(|q| (pose * **p - q).norm() <= d_op);
+    source.iter().filter(close).count() as f64 / source.len() as f64
+}
+
+/// The sum of squared residuals, what a rigid fit minimises.
+#[must_use]
+pub fn cost(pairs: &[Pair], pose: &Isometry3<f64>) -> f64 {
+    residuals(pairs, pose).iter().map(|e| e * e).sum()
+}
+
+/// The lowest cost among poses near `pose`: each of its six degrees of freedom turned (about the target's
+/// mean) and shifted both ways by several steps, the largest being `size` (radians, and `size` x `length`).
+#[must_use]
+pub fn lowest_cost_nearby(pairs: &[Pair], pose: &Isometry3<f64>, size: f64, length: f64) -> f64 {
+    let centre = pairs.iter().map(|(_, q)| q.coords).sum::<Vector3<f64>>() / pairs.len() as f64;
+    let to_centre = Translation3::from(centre);
+    let mut lowest = f64::INFINITY;
+    for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
+        for step in [size, -size, 0.1 * size, -0.1 * size, 0.01 * size, -0.01 * size] {
+            let turn = to_centre * UnitQuaternion::new(axis * step) * to_centre.inverse();
+            let shift = Translation3::from(axis * (step * length));
+            lowest = lowest.min(cost(pairs, &(turn * pose))).min(cost(pairs, &(shift * pose)));
+        }
+    }
+    lowest
+}
+
+/// The smallest distance of a corner to the line through the other two.
+#[must_use]
+pub fn triangle_height(a: &Point3<f64>, b: &Point3<f64>, c: &Point3<f64>) -> f64 {
+    let to_line = |p: &Point3<f64>, u: &Point3<f64>, v: &Point3<f64>| {
+        let Some(along) = (v - u).try_normalize(0.0) else { return 0.0 };
+        let w = p - u;
+        (w - along * w.dot(&along)).norm()
+    };
+    to_line(a, b, c).min(to_line(b, c, a)).min(to_line(c, a, b))
+}

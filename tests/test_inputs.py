@@ -1,0 +1,356 @@
+"""The table of inputs: what is taken as it is meant, what is refused and how, what finds nothing."""
+
+from typing import get_args
+
+import ibi_rs as ibi
+import numpy as np
+import pytest
+from ibi_rs.params import Ce, Scs, Te
+
+SCENE = ibi.synth.outlier_layout(
+    0, num_instances=3, num_correspondences=600, outlier_ratio=0.5, num_points=256, num_clutter=200
+)
+# Multiples of 1/16 are the same numbers in every dtype below.
+SRC, TGT = (np.round(cloud * 16) / 16 for cloud in (SCENE.src, SCENE.tgt))
+CORR = SCENE.corr
+N, Q, M = len(SRC), len(TGT), len(CORR)
+
+
+def register(src=SRC, tgt=TGT, corr=CORR, params=None, **options):
+    return ibi.register(src, tgt, corr, params, **options)
+
+
+def content(found):
+    poses = [(np.asarray(found).tobytes(), [(p.score, p.inliers.tolist()) for p in found])]
+    return poses, found.labels.tolist(), found.rounds, found.stop_reason, found.resolution
+
+
+PLAIN = register()
+
+
+class Holder:
+    """Something with one attribute, as Open3D's point clouds and trimesh's meshes are to us."""
+
+    def __init__(self, name, value):
+        setattr(self, name, value)
+
+
+class Rows:
+    """Open3D's Vector3dVector, as far as numpy sees it: a sequence of rows and no array."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def __len__(self):
+        return len(self.array)
+
+    def __getitem__(self, row):
+        return self.array[row]
+
+
+class Arrayish:
+    def __init__(self, array):
+        self.array = array
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self.array, dtype=dtype)
+
+
+def read_only(array):
+    array = array.copy()
+    array.flags.writeable = False
+    return array
+
+
+def strided(array):
+    """Every second row and column of something larger."""
+    large = np.zeros((2 * len(array), 2 * array.shape[1]), array.dtype)
+    large[::2, ::2] = array
+    return large[::2, ::2]
+
+
+def unaligned(array):
+    """A field of a packed record."""
+    packed = np.zeros(len(array), np.dtype([("tag", "u1"), ("row", array.dtype, array.shape[1])]))
+    packed["row"] = array
+    return packed["row"]
+
+
+LAYOUTS = {
+    "lists": np.ndarray.tolist,
+    "tuples": lambda a: tuple(map(tuple, a.tolist())),
+    "list of arrays": list,
+    "Fortran order": np.asfortranarray,
+    "strided": strided,
+    "negative strides": lambda a: a[::-1, ::-1].copy()[::-1, ::-1],
+    "unaligned": unaligned,
+    "read-only": read_only,
+    "big-endian": lambda a: a.astype(a.dtype.newbyteorder(">")),
+    "little-endian": lambda a: a.astype(a.dtype.newbyteorder("<")),
+    "__array__": Arrayish,
+    "sequence of rows": Rows,
+    "memoryview": memoryview,
+    "matrix of another class": lambda a: a.view(type("Tracked", (np.ndarray,), {})),
+}
+CLOUDS = {
+    **LAYOUTS,
+    "float16": lambda a: a.astype(np.float16),
+    "float32": lambda a: a.astype(np.float32),
+    "longdouble": lambda a: a.astype(np.longdouble),
+    "big-endian float32": lambda a: a.astype(">f4"),
+    ".points": lambda a: Holder("points", a),
+    ".points of rows": lambda a: Holder("points", Rows(a)),
+    ".vertices": lambda a: Holder("vertices", a),
+}
+ROWS = {
+    **LAYOUTS,
+    "int16": lambda a: a.astype(np.int16),
+    "uint16": lambda a: a.astype(np.uint16),
+    "int32": lambda a: a.astype(np.int32),
+    "uint64": lambda a: a.astype(np.uint64),
+    "big-endian int32": lambda a: a.astype(">i4"),
+    ".correspondence_set": lambda a: Holder("correspondence_set", a),
+}
+
+
+@pytest.mark.parametrize("form", CLOUDS.values(), ids=CLOUDS)
+def test_clouds_in_any_form_give_the_same(form):
+    assert content(register(src=form(SRC))) == content(PLAIN)
+    assert content(register(tgt=form(TGT))) == content(PLAIN)
+
+
+@pytest.mark.parametrize("form", ROWS.values(), ids=ROWS)
+def test_correspondences_in_any_form_give_the_same(form):
+    assert content(register(corr=form(CORR))) == content(PLAIN)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.int32, np.int64])
+def test_integer_clouds_and_small_indices(dtype):
+    rng = np.random.default_rng(1)
+    src = rng.integers(0, 100, (100, 3))
+    tgt = np.clip(src + rng.integers(-2, 3, src.shape), 0, 127)
+    corr = np.stack([np.arange(100)] * 2, axis=1)
+    plain = register(src.astype(float), tgt.astype(float), corr)
+    assert len(plain) == 1
+    found = register(src.astype(dtype), tgt.astype(dtype), corr.astype(dtype))
+    assert content(found) == content(plain)
+
+
+@pytest.mark.parametrize("form", [np.asarray, strided, np.asfortranarray, np.ndarray.tolist, Arrayish])
+def test_point_correspondences_in_any_form(form):
+    points = np.hstack([SRC[CORR[:, 0]], TGT[CORR[:, 1]]])
+    assert content(register(corr=form(points))) == content(PLAIN)
+    pair = form(points[:, :3].copy()), form(points[:, 3:].copy())
+    if not isinstance(pair[0], Arrayish):
+        assert content(register(corr=pair)) == content(PLAIN)
+
+
+def test_numbers_of_numpy_are_numbers():
+    params = ibi.Params(
+        seed=np.uint64(0), t_he_pr=np.float32(3), t_s=np.int8(5), hv=ibi.Overlap(t_overlap=0.85)
+    )
+    options = {"num_threads": np.int32(1), "max_instances": np.int64(9), "timeout_s": np.float32(60)}
+    assert content(register(params=params, **options)) == content(PLAIN)
+
+
+def test_inputs_are_left_as_they_were():
+    arrays = [SRC.copy(), TGT.copy(), CORR.copy(), np.ones((N, 3)), np.ones((Q, 3)), np.ones(M)]
+    before = [array.tobytes() for array in arrays]
+    src, tgt, corr, src_normals, tgt_normals, similarity = arrays
+    register(src, tgt, corr, src_normals=src_normals, tgt_normals=tgt_normals, similarity=similarity)
+    assert [array.tobytes() for array in arrays] == before
+
+
+# Refused -------------------------------------------------------------------------------------------------
+
+
+def put(array, place, value):
+    """A copy with one entry changed."""
+    array = np.array(array)
+    array[place] = value
+    return array
+
+
+A, T, P, V = ibi.InputError, TypeError, ibi.ParamsError, ValueError
+NAN, INF = float("nan"), float("inf")
+RAGGED = [[0.0, 1.0, 2.0], [3.0]]
+REAL = r"; it must be real numbers"
+CLOUD = r"; it must be \(N, 3\)"
+ROW = r"; rows must be integers"
+CORR_SHAPE = r"; it must be \(M, 2\) rows or \(M, 6\) points"
+FINITE = r"; coordinates must be finite"
+UNITS = r".* apart; are both in the same unit\?"
+THREADS = r"; it must be an integer from 1 to"
+ONES = {"src_normals": np.ones((N, 3)), "tgt_normals": np.ones((Q, 3))}
+
+# What is given, the exception, and a pattern that its message must begin with.
+REFUSED = [
+    *(
+        case
+        for name, cloud in (("src", SRC), ("tgt", TGT))
+        for case in [
+            ({name: cloud[:, :2]}, A, rf"{name} has shape \(\d+, 2\){CLOUD}"),
+            ({name: cloud[0]}, A, rf"{name} has shape \(3,\){CLOUD}"),
+            ({name: cloud[None]}, A, rf"{name} has shape \(1, \d+, 3\){CLOUD}"),
+            ({name: cloud.T}, A, rf"{name} has shape \(3, \d+\){CLOUD}"),
+            ({name: 3.0}, A, rf"{name} has shape \(\){CLOUD}"),
+            ({name: np.empty((4, 0))}, A, rf"{name} has shape \(4, 0\){CLOUD}"),
+            ({name: np.full((9, 3), np.longdouble("1e400"))}, A, rf"{name}\[0\] is .*inf.*{FINITE}"),
+            ({name: cloud.astype(str)}, T, rf"{name} has dtype <U\d+{REAL}"),
+            ({name: "model.ply"}, T, rf"{name} has dtype <U\d+{REAL}"),
+            ({name: cloud.astype(complex)}, T, rf"{name} has dtype complex128{REAL}"),
+            ({name: cloud > 0}, T, rf"{name} has dtype bool{REAL}"),
+            ({name: cloud.astype(object)}, T, rf"{name} has dtype object{REAL}"),
+            ({name: np.ones((9, 3), "m8[s]")}, T, rf"{name} has dtype timedelta64\[s\]{REAL}"),
+            ({name: None}, T, rf"{name} has dtype object{REAL}"),
+            ({name: object()}, T, rf"{name} has dtype object{REAL}"),
+            ({name: Holder("points", None)}, T, rf"{name} has dtype object{REAL}"),
+            ({name: RAGGED}, A, rf"{name} is not a rectangular array"),
+            ({name: put(cloud, (7, 1), NAN)}, A, rf"{name}\[7\] is .*NaN.*{FINITE}"),
+            ({name: put(cloud, (7, 1), INF)}, A, rf"{name}\[7\] is .*inf.*{FINITE}"),
+            ({name: put(cloud, (7, 1), -1e200)}, A, rf"{name}\[7\] is .*{FINITE} and below 1e100"),
+            ({name: []}, A, rf"{name} has 0 points; at least 3"),
+            ({name: np.empty((0, 3))}, A, rf"{name} has 0 points; at least 3"),
+            ({name: cloud[:1]}, A, rf"{name} has 1 points; at least 3"),
+            ({name: cloud[:2]}, A, rf"{name} has 2 points; at least 3"),
+            ({name: cloud[np.zeros(len(cloud), int)]}, A, rf"all points of {name} coincide"),
+        ]
+    ),
+    ({"src": 1e-3 * SRC}, A, rf"src is .* across but the points of tgt are {UNITS}"),
+    ({"tgt": 1e-3 * TGT}, A, rf"tgt is .* across but the points of src are {UNITS}"),
+    ({"src": 1e3 * SRC}, A, rf"tgt is .* across but the points of src are {UNITS}"),
+    ({"tgt": 1e3 * TGT}, A, rf"src is .* across but the points of tgt are {UNITS}"),
+    ({"corr": CORR[:, :1]}, A, rf"corr has shape \({M}, 1\){CORR_SHAPE}"),
+    ({"corr": CORR[0]}, A, rf"corr has shape \(2,\){CORR_SHAPE}"),
+    ({"corr": np.hstack([CORR, CORR])}, A, rf"corr has shape \({M}, 4\){CORR_SHAPE}"),
+    ({"corr": CORR[None]}, A, rf"corr has shape \(1, {M}, 2\){CORR_SHAPE}"),
+    ({"corr": np.empty((5, 0))}, A, rf"corr has shape \(5, 0\){CORR_SHAPE}"),
+    ({"corr": 7}, A, rf"corr has shape \(\){CORR_SHAPE}"),
+    ({"corr": None}, T, rf"corr has dtype object{REAL}"),
+    ({"corr": CORR.astype(str)}, T, rf"corr has dtype <U\d+{REAL}"),
+    ({"corr": CORR > 0}, T, rf"corr has dtype bool{REAL}"),
+    ({"corr": CORR.astype(object)}, T, rf"corr has dtype object{REAL}"),
+    ({"corr": CORR.astype(float)}, T, rf"corr of shape \(M, 2\) has dtype float64{ROW}"),
+    ({"corr": [[0.5, 1]]}, T, rf"corr of shape \(M, 2\) has dtype float64{ROW}"),
+    ({"corr": [[0, 1], [2]]}, A, r"corr is not a rectangular array"),
+    ({"corr": [[0, 1], [2], [3, 4]]}, A, r"corr is not a rectangular array"),
+    ({"corr": ([[0, 1, 2]], RAGGED)}, A, r"corr is not a rectangular array"),
+    ({"corr": put(CORR, (5, 0), N)}, A, rf"corr\[5, 0\] is {N}; src has rows 0 to {N - 1}"),
+    ({"corr": put(CORR, (5, 1), Q)}, A, rf"corr\[5, 1\] is {Q}; tgt has rows 0 to {Q - 1}"),
+    ({"corr": put(CORR, (5, 0), -1)}, A, rf"corr\[5, 0\] is -1; src has rows 0 to {N - 1}"),
+    ({"corr": put(CORR, (5, 1), -(2**63))}, A, rf"corr\[5, 1\] is -{2**63}; tgt has rows"),
+    ({"corr": put(CORR.astype("u8"), (5, 1), 2**63)}, A, rf"corr\[5, 1\] is \d+; tgt has rows 0 to {Q - 1}"),
+    ({"corr": put(np.ones((9, 6)), (2, 1), NAN)}, A, rf"corr\[2\] is .*NaN.*{FINITE}"),
+    ({"corr": put(np.ones((9, 6)), (2, 4), INF)}, A, rf"corr\[2\] is .*inf.*{FINITE}"),
+    ({"corr": (SRC[:5], TGT[:4])}, A, r"corr is a pair of 5 and 4 points; it must be of equally many"),
+    ({"corr": (SRC[:5], TGT[:5] > 0)}, T, rf"corr\[1\] has dtype bool{REAL}"),
+    ({"src_normals": ONES["src_normals"]}, A, r"src_normals is given but tgt_normals is not; .*both"),
+    ({"tgt_normals": ONES["tgt_normals"]}, A, r"tgt_normals is given but src_normals is not; .*both"),
+    *(
+        case
+        for name, cloud, of in (("src_normals", SRC, "src"), ("tgt_normals", TGT, "tgt"))
+        for case in [
+            ({**ONES, name: 0 * cloud}, A, rf"{name}\[0\] has length 0; a normal must have a direction"),
+            ({**ONES, name: put(ONES[name], 3, 0)}, A, rf"{name}\[3\] has length 0; a normal must"),
+            (
+                {**ONES, name: ONES[name][:-1]},
+                A,
+                rf"{name} has \d+ rows; it must have one for each .* of {of}",
+            ),
+            ({**ONES, name: ONES[name][:, :2]}, A, rf"{name} has shape \(\d+, 2\){CLOUD}"),
+            ({**ONES, name: put(ONES[name], (3, 2), NAN)}, A, rf"{name}\[3\] is .*NaN.*{FINITE}"),
+            ({**ONES, name: ONES[name].astype(str)}, T, rf"{name} has dtype <U\d+{REAL}"),
+        ]
+    ),
+    ({"similarity": np.ones(M - 1)}, A, rf"similarity has {M - 1} rows; .* each of the {M} rows of corr"),
+    ({"similarity": []}, A, rf"similarity has 0 rows; .* each of the {M} rows of corr"),
+    ({"similarity": np.ones((M, 1))}, A, rf"similarity has shape \({M}, 1\); it must be \(M,\)"),
+    ({"similarity": 1.0}, A, r"similarity has shape \(\); it must be \(M,\)"),
+    ({"similarity": put(np.ones(M), 4, NAN)}, A, r"similarity\[4\] is NaN; it must be finite"),
+    ({"similarity": put(np.ones(M), 4, -INF)}, A, r"similarity\[4\] is -inf; it must be finite"),
+    ({"similarity": ["high"] * M}, T, rf"similarity has dtype <U4{REAL}"),
+    ({"viewpoint": (0, 0)}, A, r"viewpoint has shape \(2,\); it must be \(3,\)"),
+    ({"viewpoint": [[0, 0, 0]]}, A, r"viewpoint has shape \(1, 3\); it must be \(3,\)"),
+    ({"viewpoint": (0, NAN, 0)}, A, rf"viewpoint\[0\] is .*NaN.*{FINITE}"),
+    ({"viewpoint": "above"}, T, rf"viewpoint has dtype <U5{REAL}"),
+    *(({"num_threads": n}, V, rf"num_threads is {n!r}{THREADS}") for n in (0, -1, 1.5, "two", True, 10**30)),
+    ({"params": {"t_s": 5}}, T, r"params must be ibi_rs.Params, not dict"),
+    ({"params": "paper_real"}, T, r"params must be ibi_rs.Params, not str"),
+    ({"params": ibi.Params}, T, r"params must be ibi_rs.Params, not type"),
+    ({"params": ibi.Gtm()}, T, r"params must be ibi_rs.Params, not Gtm"),
+    ({"max_instances": -1}, P, r"params.max_instances is -1; it must be an integer from 0"),
+    ({"max_instances": 1.5}, P, r"params.max_instances is 1.5; it must be an integer from 0"),
+    ({"timeout_s": -1}, P, r"params.timeout_s is -1; it must be between 0 and 1e9"),
+    ({"timeout_s": NAN}, P, r"params.timeout_s is nan; it must be a finite number"),
+    ({"timeout_s": "1 s"}, P, r"params.timeout_s is '1 s'; it must be a finite number"),
+    ({"callback": 3}, T, r"callback must be callable, not int"),
+]
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "pattern"), REFUSED, ids=[f"{i}-{case[2][:24]}" for i, case in enumerate(REFUSED)]
+)
+def test_what_cannot_be_used_is_refused_in_one_line(given, kind, pattern, capfd):
+    with pytest.raises(kind, match="^" + pattern) as caught:
+        register(**given)
+    assert caught.type is kind
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "1.5", "two", " ", "99999999999999999999", "70000"])
+def test_a_bad_environment_is_refused_by_its_name(monkeypatch, text):
+    monkeypatch.setenv("IBI_NUM_THREADS", text)
+    with pytest.raises(ValueError, match=rf"^IBI_NUM_THREADS is .*{text}.*{THREADS}"):
+        register()
+    assert content(register(num_threads=1)) == content(PLAIN)  # not asked where the argument is given
+
+
+def test_input_errors_are_value_errors():
+    assert issubclass(ibi.InputError, ValueError)
+    assert issubclass(ibi.ParamsError, ValueError)
+    assert (ibi.InputError.__module__, ibi.ParamsError.__module__) == ("ibi_rs", "ibi_rs")
+
+
+# Nothing to find -----------------------------------------------------------------------------------------
+
+LINE = np.linspace(0, 1, 50)[:, None] * [1.0, 2.0, 3.0]
+SAME = np.stack([np.arange(50)] * 2, axis=1)
+# Every variant once, and a validation that accepts whatever it is shown.
+VARIANTS = [
+    (stage, variant.variant)
+    for stage, union in (("scs", Scs), ("ce", Ce), ("te", Te))
+    for variant in get_args(union) or (union,)
+]
+CREDULOUS = {f"{stage} {word}": ibi.Params(**{stage: word}, hv="none") for stage, word in VARIANTS}
+
+FRUITLESS = {
+    "no correspondence": ({"corr": CORR[:0]}, "few_correspondences"),
+    "an empty list": ({"corr": []}, "few_correspondences"),
+    "an empty array of floats": ({"corr": np.empty((0, 6))}, "few_correspondences"),
+    "an empty pair": ({"corr": (np.empty((0, 3)), np.empty((0, 3)))}, "few_correspondences"),
+    "one": ({"corr": CORR[:1]}, "few_correspondences"),
+    "two": ({"corr": CORR[:2]}, "few_correspondences"),
+    "three": ({"corr": CORR[:3]}, None),
+    "one, many times": ({"corr": CORR[np.zeros(500, int)]}, None),
+    "all to one target point": ({"corr": np.stack([CORR[:, 0], 0 * CORR[:, 0]], axis=1)}, None),
+    "all from one source point": ({"corr": np.stack([0 * CORR[:, 0], CORR[:, 1]], axis=1)}, None),
+    "a line to a line": ({"src": LINE, "tgt": LINE + 1, "corr": SAME}, None),
+    "a line to a scene": ({"src": LINE, "corr": SAME}, None),
+    "a scene to a line": ({"tgt": LINE, "corr": SAME}, None),
+    "points on a line, not of it": ({"corr": np.hstack([LINE, LINE])}, None),
+}
+
+
+@pytest.mark.parametrize("params", [None, *CREDULOUS.values()], ids=["default", *CREDULOUS])
+@pytest.mark.parametrize(("given", "reason"), FRUITLESS.values(), ids=FRUITLESS)
+def test_finding_nothing_is_an_answer(given, reason, params, capfd):
+    """Even where every pose is accepted what fixes no pose gives none, and above all no identity."""
+    found = register(**given, params=params)
+    assert len(found) == 0
+    assert np.asarray(found).shape == (0, 4, 4)
+    assert (found.labels == -1).all()
+    allowed = ("few_seeds", "few_correspondences") if reason is None else (reason,)
+    assert found.stop_reason.name in allowed
+    assert found.stop_reason.value < found.stop_reason.threshold
+    assert capfd.readouterr() == ("", "")

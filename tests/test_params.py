@@ -1,0 +1,315 @@
+"""Parameters: the core's defaults, every way in and out, and what is refused."""
+
+import copy
+import json
+import pickle
+from dataclasses import FrozenInstanceError, asdict, fields
+from typing import get_args
+
+import ibi_rs as ibi
+import numpy as np
+import pytest
+from ibi_rs import _core
+from ibi_rs.params import Ce, Hv, Removal, Scs, Te
+
+STAGES = ("scs", "ce", "te", "hv")
+VARIANTS = {name: get_args(union) or (union,) for name, union in zip(STAGES, (Scs, Ce, Te, Hv), strict=True)}
+EACH_VARIANT = [(stage, variant) for stage, variants in VARIANTS.items() for variant in variants]
+
+PLAIN = ibi.Params()
+OTHER = ibi.Params(
+    seed=2**64 - 1,
+    resolution=0.05,
+    delta_r_pr=1 / 3,
+    t_he_pr=2.5,
+    d_op_pr=2,
+    t_s=7,
+    scs=ibi.Gtm(n_downsample=500, n_gtm=30, payoff="ratio"),
+    ce=ibi.Off(),
+    te=ibi.Ransac(n_ransac=5000, min_height_pr=0),
+    hv=ibi.InlierCount(t_inliers=100),
+    removal=get_args(Removal)[-1],
+    max_rounds=9,
+    max_instances=0,
+    timeout_s=1e-3,
+)
+SETTINGS = {
+    "default": PLAIN,
+    "other": OTHER,
+    "paper_synthetic": ibi.Params.paper_synthetic(),
+    "paper_real": ibi.Params.paper_real(),
+}
+each_setting = pytest.mark.parametrize("params", SETTINGS.values(), ids=SETTINGS)
+
+
+# Defaults ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["default", "paper_synthetic", "paper_real"])
+def test_presets_are_those_of_the_core(name):
+    assert SETTINGS[name].to_dict() == json.loads(_core.preset(name))
+
+
+def test_defaults_are_those_of_the_core():
+    """Read from the fields, before any check could complete them."""
+    core = json.loads(_core.preset("default"))
+    assert [f.name for f in fields(ibi.Params)] == list(core)
+    for f in fields(ibi.Params):
+        value = f.default
+        if f.name in VARIANTS:
+            value = {"variant": value.variant, **asdict(value)}
+        assert value == core[f.name], f.name
+
+
+@pytest.mark.parametrize(("stage", "variant"), EACH_VARIANT)
+def test_defaults_of_each_variant_are_those_of_the_core(stage, variant):
+    core = json.loads(_core.check_params(json.dumps({stage: {"variant": variant.variant}})))
+    assert {"variant": variant.variant, **asdict(variant())} == core[stage]
+
+
+def test_the_core_knows_no_further_variant():
+    for stage, variants in VARIANTS.items():
+        with pytest.raises(ibi.ParamsError) as caught:
+            _core.check_params(json.dumps({stage: {"variant": "?"}}))
+        expected = str(caught.value).partition("expected ")[2]
+        assert expected.count("`") == 2 * len(variants)
+        assert all(f"`{variant.variant}`" in expected for variant in variants)
+
+
+def test_the_default_is_the_paper_for_synthetic_data_with_a_smaller_t_he():
+    assert ibi.Params.paper_synthetic().replace(t_he_pr=3) == PLAIN
+
+
+# There and back ------------------------------------------------------------------------------------------
+
+
+@each_setting
+def test_dict_json_and_toml_lead_back(params):
+    assert ibi.Params.from_dict(params.to_dict()) == params
+    assert ibi.Params.from_dict(json.loads(json.dumps(params.to_dict()))) == params
+    assert ibi.Params.from_toml(params.to_toml()) == params
+
+
+@each_setting
+@pytest.mark.parametrize("name", ["params.toml", "params.json"])
+def test_files_lead_back(params, name, tmp_path):
+    params.save(tmp_path / name)
+    assert ibi.Params.load(tmp_path / name) == params
+    assert ibi.Params.load(str(tmp_path / name)) == params
+
+
+@each_setting
+def test_copies_are_equal(params):
+    for twin in (pickle.loads(pickle.dumps(params)), copy.deepcopy(params), params.replace()):
+        assert twin == params
+        assert hash(twin) == hash(params)
+    assert eval(repr(params), vars(ibi)) == params
+
+
+def test_what_is_left_out_is_defaulted():
+    assert ibi.Params.from_dict({}) == ibi.Params.from_toml("") == PLAIN
+    assert ibi.Params.from_dict({"t_s": 6}) == ibi.Params.from_toml("t_s = 6") == ibi.Params(t_s=6)
+    block = {"te": {"variant": "ransac", "n_ransac": 50}}
+    params = ibi.Params(te=ibi.Ransac(n_ransac=50))
+    assert ibi.Params.from_dict(block) == params
+    assert ibi.Params.from_toml('[te]\nvariant = "ransac"\nn_ransac = 50') == params
+
+
+# As values -----------------------------------------------------------------------------------------------
+
+
+def test_words_stand_for_stages():
+    for stage, variant in EACH_VARIANT:
+        params = ibi.Params(**{stage: variant.variant})
+        assert params == ibi.Params(**{stage: variant()})
+        assert getattr(params, stage) == variant()
+        assert PLAIN.replace(**{stage: variant.variant}) == params
+        assert ibi.Params.from_dict({stage: variant.variant}) == params
+
+
+def test_params_are_frozen_values():
+    assert ibi.Params(t_s=6) == ibi.Params(t_s=6) != PLAIN
+    assert ibi.Params(ce="off") != PLAIN
+    assert {PLAIN: "a", ibi.Params(t_s=5): "b"} == {PLAIN: "b"}
+    for frozen, name in ((PLAIN, "t_s"), (PLAIN.scs, "n_gtm")):
+        with pytest.raises(FrozenInstanceError):
+            setattr(frozen, name, 9)
+
+
+def test_replace_leaves_the_original():
+    assert PLAIN.replace(t_s=6, hv="none") == ibi.Params(t_s=6, hv=ibi.None_())
+    assert PLAIN.t_s == 5
+    with pytest.raises(TypeError, match="t_z"):
+        PLAIN.replace(t_z=6)
+
+
+def test_numbers_become_plain_ones():
+    params = ibi.Params(
+        seed=np.int16(3), t_he_pr=np.float32(0.5), t_s=np.array(6), d_op_pr=2, scs=ibi.Gtm(n_gtm=np.uint8(9))
+    )
+    assert params == ibi.Params(seed=3, t_he_pr=0.5, t_s=6, d_op_pr=2.0, scs=ibi.Gtm(n_gtm=9))
+    values = (params.seed, params.t_he_pr, params.t_s, params.d_op_pr, params.scs.n_gtm)
+    assert [type(value) for value in values] == [int, float, int, float, int]
+
+
+def test_a_subclass_stays_one():
+    class Mine(ibi.Params):
+        pass
+
+    made = (Mine(), Mine.paper_real(), Mine.from_dict({}), Mine.from_toml(""), Mine().replace(t_s=6))
+    assert {type(params) for params in made} == {Mine}
+
+
+# Refused -------------------------------------------------------------------------------------------------
+
+NAN, INF = float("nan"), float("inf")
+FLOAT, INT = "it must be a finite number", "it must be an integer from 0 to"
+
+# Arguments, and what the message must begin with.
+REFUSED = [
+    ({"seed": -1}, f"params.seed is -1; {INT} 18446744073709551615"),
+    ({"seed": 2**64}, f"params.seed is 18446744073709551616; {INT}"),
+    ({"seed": 1.0}, f"params.seed is 1.0; {INT}"),
+    ({"seed": "1"}, f"params.seed is '1'; {INT}"),
+    ({"seed": None}, f"params.seed is None; {INT}"),
+    ({"seed": np.arange(3)}, f"params.seed is array([0, 1, 2]); {INT}"),
+    ({"seed": np.eye(9)}, "params.seed is array([[1., 0., 0.,"),
+    ({"resolution": 0}, "params.resolution is 0; it must be between 1e-9 and 1e9"),
+    ({"resolution": NAN}, f"params.resolution is nan; {FLOAT}"),
+    ({"delta_r_pr": 0}, "params.delta_r_pr is 0; it must be between"),
+    ({"delta_r_pr": "10"}, f"params.delta_r_pr is '10'; {FLOAT}"),
+    ({"t_he_pr": -3}, "params.t_he_pr is -3; it must be between"),
+    ({"t_he_pr": INF}, f"params.t_he_pr is inf; {FLOAT}"),
+    ({"t_he_pr": 10**400}, "params.t_he_pr is 1000000"),
+    ({"t_he_pr": np.float32(NAN)}, f"params.t_he_pr is nan; {FLOAT}"),
+    ({"d_op_pr": None}, f"params.d_op_pr is None; {FLOAT}"),
+    ({"d_op_pr": 1j}, f"params.d_op_pr is 1j; {FLOAT}"),
+    ({"t_s": 2}, "params.t_s is 2; it must be at least 3"),
+    ({"t_s": 5.5}, f"params.t_s is 5.5; {INT}"),
+    ({"t_s": True}, f"params.t_s is True; {INT}"),
+    ({"removal": "all"}, "params.removal is 'all'; it must be one of 'dense'"),
+    ({"max_rounds": -1}, f"params.max_rounds is -1; {INT}"),
+    ({"max_instances": 2**32}, f"params.max_instances is 4294967296; {INT}"),
+    ({"timeout_s": -1}, "params.timeout_s is -1; it must be between 0 and 1e9 seconds"),
+    ({"timeout_s": INF}, f"params.timeout_s is inf; {FLOAT}"),
+    ({"scs": "gmt"}, "params.scs is 'gmt'; it must be one of 'gtm'"),
+    ({"scs": None}, "params.scs is None; it must be one of Gtm()"),
+    ({"ce": "none"}, "params.ce is 'none'; it must be one of 'voting', 'off'"),
+    ({"ce": ibi.Gtm()}, "params.ce is Gtm("),
+    ({"te": ibi.Gsac}, "params.te is <class 'ibi_rs.params.Gsac'>; it must be one of Gsac(), "),
+    ({"hv": "off"}, "params.hv is 'off'; it must be one of 'overlap', 'inlier_count', 'none'"),
+    ({"scs": ibi.Gtm(n_downsample=2)}, "params.scs.n_downsample is 2; it must be at least 3"),
+    ({"scs": ibi.Gtm(n_downsample=16385)}, "params.scs.n_downsample is 16385; it must be at most 16384"),
+    ({"scs": ibi.Gtm(n_gtm=0)}, "params.scs.n_gtm is 0; it must be at least 1"),
+    (
+        {"scs": ibi.Gtm(payoff="linear")},
+        "params.scs.payoff is 'linear'; it must be one of 'gaussian', 'ratio'",
+    ),
+    ({"ce": ibi.Voting(n_vot=2)}, "params.ce.n_vot is 2; it must be at least 3"),
+    ({"ce": ibi.Voting(n_vot=300.5)}, f"params.ce.n_vot is 300.5; {INT}"),
+    ({"te": ibi.Gsac(n_gsac=0)}, "params.te.n_gsac is 0; it must be at least 1"),
+    ({"te": ibi.Gsac(min_height_pr=-1)}, "params.te.min_height_pr is -1; it must be 0 or between"),
+    ({"te": ibi.Ransac(n_ransac=0)}, "params.te.n_ransac is 0; it must be at least 1"),
+    ({"te": ibi.Ransac(n_ransac=10**7 + 1)}, "params.te.n_ransac is 10000001; it must be at most 10,000,000"),
+    ({"te": ibi.Ransac(n_ransac=None)}, f"params.te.n_ransac is None; {INT}"),
+    ({"hv": ibi.Overlap(t_overlap=1.1)}, "params.hv.t_overlap is 1.1; it must be between 0 and 1"),
+    ({"hv": ibi.Overlap(t_overlap=NAN)}, f"params.hv.t_overlap is nan; {FLOAT}"),
+    ({"hv": ibi.InlierCount(t_inliers=0)}, "params.hv.t_inliers is 0; it must be at least 1"),
+]
+
+
+@pytest.mark.parametrize(("given", "start"), REFUSED, ids=[case[1][:40] for case in REFUSED])
+def test_what_is_out_of_range_is_refused_in_one_short_line(given, start):
+    for make in (ibi.Params, PLAIN.replace):
+        with pytest.raises(ibi.ParamsError) as caught:
+            make(**given)
+        message = str(caught.value)
+        assert message.startswith(start)
+        assert "\n" not in message
+        assert len(message) < 200
+
+
+DATA = [
+    ({"t_z": 1}, "`t_z`"),
+    ({"seed": 1, "Seed": 2}, "`Seed`"),
+    ({1: 2}, "`1`"),
+    ({"odd": object()}, "`odd`"),
+    ({"odd": {"x": NAN}}, "`odd`"),
+    ({"scs": {"variant": "gtm", "n_gmt": 1}}, "`n_gmt`"),
+    ({"te": {"variant": "gsac", "n_ransac": 1}}, "`n_ransac`"),
+    ({"te": {"n_gsac": 5}}, "params.te names no variant"),
+    ({"te": {}}, "params.te names no variant"),
+    ({"te": None}, "params.te is None; it must be one of 'gsac', "),
+    ({"te": {"variant": "g"}}, "params.te is 'g'; it must be one of 'gsac', "),
+    ({"te": {"variant": ["gsac"]}}, "params.te is ['gsac']; it must be one of 'gsac', "),
+    ({"te": {"variant": "gsac", "n_gsac": "5"}}, f"params.te.n_gsac is '5'; {INT}"),
+    ({"seed": {}}, f"params.seed is {{}}; {INT}"),
+    ({"t_he_pr": [3]}, f"params.t_he_pr is [3]; {FLOAT}"),
+    ({"t_s": 2}, "params.t_s is 2; it must be at least 3"),
+]
+
+
+@pytest.mark.parametrize(("data", "part"), DATA, ids=[case[1][:40] for case in DATA])
+def test_a_dict_is_refused_by_the_name_of_what_is_wrong(data, part):
+    with pytest.raises(ibi.ParamsError) as caught:
+        ibi.Params.from_dict(data)
+    assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+TOML = [
+    ("t_z = 1", "`t_z`"),
+    ("t_s = 2", "params.t_s is 2; it must be at least 3"),
+    ("t_he_pr = nan", "params.t_he_pr is NaN; it must be between"),
+    ("\nseed = -1", "line 2"),
+    ("seed == 1", "line 1"),
+    ('[ce]\nvariant = "of"', "`of`"),
+    ('[scs]\nvariant = "gtm"\nn_gmt = 1', "`n_gmt`"),
+]
+
+
+@pytest.mark.parametrize(("text", "part"), TOML, ids=[case[1][:40] for case in TOML])
+def test_toml_is_refused_with_the_place(text, part):
+    with pytest.raises(ibi.ParamsError) as caught:
+        ibi.Params.from_toml(text)
+    assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["bad.toml", "bad.json"])
+@pytest.mark.parametrize("text", ['{"t_z": 1}', "t_z = 1", "?", "\xff"])
+def test_a_bad_file_is_named(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(ibi.ParamsError, match=r"bad\.(toml|json): ") as caught:
+        ibi.Params.load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_says_its_format_by_its_name(tmp_path):
+    for action in (PLAIN.save, ibi.Params.load):
+        with pytest.raises(ValueError, match=r"params\.yaml: a parameter file must end in \.toml or \.json"):
+            action(tmp_path / "params.yaml")
+    with pytest.raises(FileNotFoundError):
+        ibi.Params.load(tmp_path / "missing.toml")
+
+
+@pytest.mark.parametrize("data", [None, 3, [("t_s", 5)], "t_s"])
+def test_a_dict_must_be_one(data):
+    with pytest.raises(TypeError, match="params must be a mapping, not"):
+        ibi.Params.from_dict(data)
+
+
+def test_unknown_names_are_named():
+    for make in (ibi.Params, *(variant for _, variant in EACH_VARIANT)):
+        with pytest.raises(TypeError, match="t_z"):
+            make(t_z=1)
+        with pytest.raises(TypeError, match="positional"):  # a bare number says nothing
+            make(1)
+
+
+def test_parameter_errors_cross_processes():
+    with pytest.raises(ibi.ParamsError) as caught:
+        ibi.Params(t_s=1)
+    twin = pickle.loads(pickle.dumps(caught.value))
+    assert (type(twin), str(twin)) == (ibi.ParamsError, str(caught.value))
