@@ -33,6 +33,7 @@ PRESETS = {
     "default": ibi_rs.Params(),
     "paper_synthetic": ibi_rs.Params.paper_synthetic(),
     "paper_real": ibi_rs.Params.paper_real(),
+    "single_view": ibi_rs.Params.single_view(),
 }
 
 
@@ -58,7 +59,7 @@ def check_presets(app: Sphinx) -> None:
         written[name] = cells
     values = [_plain_values(params) for params in PRESETS.values()]
     names = {name for preset in values for name in preset}
-    real = {name: [_shown(preset.get(name)) for preset in values] for name in sorted(names)}
+    real = {name: [_shown(preset[name]) if name in preset else "–" for preset in values] for name in names}
     for name in sorted(names | written.keys()):
         if written.get(name) != real.get(name):
             text = "parameters.md, preset table: %s is %s in the package and %s on the page"

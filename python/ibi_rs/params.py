@@ -251,12 +251,15 @@ class Params:
     refine
         How a hypothesis is polished on the clouds before it is validated: ``"none"``, or ``"icp"``, iterative
         closest points, point-to-plane where normals count.
+    n_contest
+        A contest lasts this many rounds: at its end the hypotheses that passed validation become instances, best
+        value first. 1: each at once, as it is found. At least 1.
     removal
         Which correspondences a round removes; ``"dense"``: those that the enhancement ranked; ``"inliers"``:
         those within 2 ``t_he`` of an accepted pose and those whose target point it explains, while the seeds
         of a rejected one may not lead again.
     max_rejections, max_rounds, max_instances
-        A run ends after so many rejections in a row, rounds or instances; None: no limit.
+        A run ends after so many rounds without a new instance, rounds, or instances; None: no limit.
     timeout_s
         A run ends after so many seconds and keeps what it has; None: no limit.
 
@@ -288,6 +291,7 @@ class Params:
     te: Te = Gsac()
     hv: Hv = Overlap()
     refine: Refine = "none"
+    n_contest: int = 1
     removal: Removal = "dense"
     max_rejections: int | None = None
     max_rounds: int | None = None

@@ -117,7 +117,7 @@ class Round:
 
     @property
     def accepted(self) -> bool:
-        """Whether the round found an instance."""
+        """Whether the hypothesis passed validation."""
         return self.verdict is not None and self.verdict.accepted
 
     @classmethod

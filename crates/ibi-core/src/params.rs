@@ -43,9 +43,12 @@ pub struct Params {
     pub hv: Hv,
     /// How a hypothesis is polished on the clouds before it is validated.
     pub refine: Refine,
+    /// A contest lasts this many rounds: at its end the hypotheses that passed validation become instances, best
+    /// value first. 1: each at once, as it is found. At least 1.
+    pub n_contest: u32,
     /// Which correspondences a round removes.
     pub removal: Removal,
-    /// A run ends after this many rejections in a row; `None`: no limit.
+    /// A run ends after this many rounds without a new instance; `None`: no limit.
     pub max_rejections: Option<u32>,
     /// A run ends after this many rounds; `None`: no limit.
     pub max_rounds: Option<u32>,
@@ -105,6 +108,7 @@ impl Params {
             te: Gsac { n_gsac: 100, ..Gsac::default() }.into(),
             hv: Overlap { t_overlap: 0.85, exclusive: false }.into(),
             refine: Refine::None,
+            n_contest: 1,
             removal: Removal::Dense,
             max_rejections: None,
             max_rounds: None,
@@ -142,6 +146,7 @@ impl Params {
             te: Irls::default().into(),
             refine: Refine::Icp,
             hv: Overlap { t_overlap: 0.35, exclusive: true }.into(),
+            n_contest: 60,
             removal: Removal::Inliers,
             max_rejections: Some(150),
             ..Self::paper_synthetic()
@@ -160,6 +165,7 @@ impl Params {
         let cos = self.min_normal_cos.unwrap_or(0.0);
         check("min_normal_cos", cos, (-1.0..=1.0).contains(&cos), "between -1 and 1")?;
         at_least_3("t_s", self.t_s)?;
+        at_least_1("n_contest", self.n_contest)?;
         let timeout_s = self.timeout_s.unwrap_or(0.0);
         check("timeout_s", timeout_s, (0.0..=1e9).contains(&timeout_s), "between 0 and 1e9 seconds")?;
         self.scs.check()?;

@@ -8,11 +8,14 @@ use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
 use crate::kernels::par::Pool;
-use crate::params::{Params, Removal};
+use crate::params::Params;
 use crate::registration::{Registration, Round, StopReason};
 use crate::scene::{Cloud, PreparedCloud, Scene};
 use crate::stages::{Enhance, EstimatePose, SelectSeeds, Validate};
 use crate::state::{Problem, State};
+
+/// A contest accepts nothing below this share of its best value.
+const CONTEST_MARGIN: f64 = 0.8;
 
 /// A prepared source, the parameters and the four stages; registers the source to any number of targets.
 ///
@@ -189,57 +192,70 @@ impl<'a> Registrar<'a> {
     pub fn step(&self, state: &mut State<'_>) -> ControlFlow<StopReason, Round> {
         let pool = Arc::clone(&state.pool);
         pool.install(|| {
-            state.check_limits(&self.params)?;
-            let context = state.problem.context(&self.params, state.rounds.len());
-            let times = &mut state.timings;
-
-            let seeds = timed(&mut times.scs_s, || self.scs().select_seeds(&context));
-            state.problem.interrupt.check()?;
-            if seeds.len() < self.params.t_s as usize {
-                let (value, threshold) = (seeds.len() as u32, self.params.t_s);
-                return ControlFlow::Break(StopReason::FewSeeds { value, threshold });
-            }
-            let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
-            let mut estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
-            if let Some(hypothesis) = &mut estimate.hypothesis {
-                let pose = &mut hypothesis.target_from_source;
-                *pose = timed(&mut times.refine_s, || context.scene.refined(&self.params, pose));
-            }
-            let verdict = estimate
-                .hypothesis
-                .map(|hypothesis| timed(&mut times.hv_s, || self.hv().validate(&context, &hypothesis)));
-            state.problem.interrupt.check()?;
-
-            let pose = estimate.hypothesis.filter(|_| verdict.is_some_and(|v| v.accepted()));
-            let (removed, barred) = match (self.params.removal, pose) {
-                (Removal::Dense, _) => (dense.ids().to_vec(), &[][..]),
-                (Removal::Inliers, None) => (Vec::new(), seeds.ids()),
-                // The seeds too are barred: they may all lie outside of the pose that they led to.
-                (Removal::Inliers, Some(hypothesis)) => {
-                    (context.spent(&hypothesis.target_from_source), seeds.ids())
+            loop {
+                match self.round(state) {
+                    // Candidates still waiting may free the way for further rounds.
+                    ControlFlow::Break(reason) if reason.is_dry() && self.settle(state) > 0 => {}
+                    flow => return flow,
                 }
-            };
-            let round = Round {
-                index: context.round,
-                num_alive: context.alive.ids().len() as u32,
-                num_seeds: seeds.len() as u32,
-                num_dense: dense.len() as u32,
-                num_samples: estimate.num_samples,
-                num_degenerate: estimate.num_degenerate,
-                hypothesis_score: estimate.hypothesis.map(|h| h.score),
-                verdict,
-                num_removed: 0,
-                num_barred: 0,
-            };
-            state.conclude(&self.params, round, pose, &removed, barred)
+            }
         })
+    }
+
+    fn round(&self, state: &mut State<'_>) -> ControlFlow<StopReason, Round> {
+        state.check_limits(&self.params)?;
+        let context = state.problem.context(&self.params, state.rounds.len());
+        let times = &mut state.timings;
+
+        let seeds = timed(&mut times.scs_s, || self.scs().select_seeds(&context));
+        state.problem.interrupt.check()?;
+        if seeds.len() < self.params.t_s as usize {
+            let (value, threshold) = (seeds.len() as u32, self.params.t_s);
+            return ControlFlow::Break(StopReason::FewSeeds { value, threshold });
+        }
+        let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
+        let mut estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
+        if let Some(hypothesis) = &mut estimate.hypothesis {
+            let pose = &mut hypothesis.target_from_source;
+            *pose = timed(&mut times.refine_s, || context.scene.refined(&self.params, pose));
+        }
+        let verdict = estimate
+            .hypothesis
+            .map(|hypothesis| timed(&mut times.hv_s, || self.hv().validate(&context, &hypothesis)));
+        state.problem.interrupt.check()?;
+
+        state.conclude(&self.params, &seeds, &dense, &estimate, verdict);
+        if state.rounds_since_settling >= self.params.n_contest {
+            self.settle(state);
+        }
+        state.last_round()
+    }
+
+    /// Ends a contest: of the hypotheses that passed validation, the one with the best value becomes an
+    /// instance and claims its scene points; the others are measured again on what is left, and so on. Those far
+    /// below the best stay for the next contest, in which a better pose of the same instance may turn up.
+    fn settle(&self, state: &mut State<'_>) -> u32 {
+        let mut best_value = None;
+        let mut num_accepted = 0;
+        while self.params.max_instances.is_none_or(|limit| state.num_found() < limit) {
+            state.measure_candidates(&self.params, self.hv());
+            let least = best_value.map_or(f64::NEG_INFINITY, |value: f64| CONTEST_MARGIN * value);
+            let Some(value) = state.accept_best(&self.params, least) else { break };
+            best_value = best_value.or(Some(value));
+            num_accepted += 1;
+        }
+        state.rounds_since_settling = 0;
+        num_accepted
     }
 
     /// Turns what a run has found into its result.
     #[must_use]
-    pub fn finish(&self, state: State<'_>, stop_reason: StopReason) -> Registration {
+    pub fn finish(&self, mut state: State<'_>, stop_reason: StopReason) -> Registration {
         let pool = Arc::clone(&state.pool);
-        pool.install(|| state.into_registration(&self.params, stop_reason))
+        pool.install(|| {
+            self.settle(&mut state);
+            state.into_registration(&self.params, stop_reason)
+        })
     }
 
     fn scs(&self) -> &dyn SelectSeeds {

@@ -71,7 +71,7 @@ pub struct Round {
 }
 
 impl Round {
-    /// Whether the round found an instance.
+    /// Whether the hypothesis passed validation.
     #[must_use]
     pub fn accepted(&self) -> bool {
         self.verdict.is_some_and(|verdict| verdict.accepted())
@@ -97,9 +97,9 @@ pub enum StopReason {
         /// 3.
         threshold: u32,
     },
-    /// `max_rejections` poses in a row were rejected.
+    /// `max_rejections` rounds in a row found no instance.
     MaxRejections {
-        /// Rejections in a row.
+        /// Rounds since the last instance.
         value: u32,
         /// The limit.
         threshold: u32,
@@ -130,6 +130,19 @@ pub enum StopReason {
     /// A round removed and barred nothing, so the next might repeat it for ever. The global game (`gtm`) with
     /// removal `inliers` can come to this.
     Stalled,
+}
+
+impl StopReason {
+    /// Whether the rounds ran dry, rather than being ended by a limit or from outside.
+    pub(crate) fn is_dry(&self) -> bool {
+        matches!(
+            self,
+            Self::FewSeeds { .. }
+                | Self::FewCorrespondences { .. }
+                | Self::MaxRejections { .. }
+                | Self::Stalled
+        )
+    }
 }
 
 impl std::fmt::Display for StopReason {

@@ -11,10 +11,10 @@ use crate::interrupt::Interrupt;
 use crate::kernels::graph::Graph;
 use crate::kernels::overlap::overlap;
 use crate::kernels::par::Pool;
-use crate::params::Params;
+use crate::params::{Params, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
 use crate::scene::Scene;
-use crate::stages::{Context, Hypothesis};
+use crate::stages::{Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
 
 /// Fewest correspondences that fix a pose.
 const MIN_CORRESPONDENCES: u32 = 3;
@@ -26,7 +26,11 @@ pub struct State<'a> {
     pub(crate) rounds: Vec<Round>,
     pub(crate) timings: Timings,
     pub(crate) pool: Arc<Pool>,
+    pub(crate) rounds_since_settling: u32,
+    candidates: Vec<Candidate>,
     found: Vec<Found>,
+    /// Rounds that had been played when the last instance was found.
+    last_found_at: u32,
     start: Instant,
 }
 
@@ -40,6 +44,16 @@ pub(crate) struct Problem<'a> {
     pub(crate) claimed: Vec<bool>,
     pub(crate) graph: OnceLock<Graph>,
     pub(crate) interrupt: Interrupt,
+}
+
+/// A hypothesis that passed validation and waits for the end of the contest.
+#[derive(Debug, Clone, Copy)]
+struct Candidate {
+    hypothesis: Hypothesis,
+    value: f64,
+    round: u32,
+    /// How many instances had claimed their points when it was measured.
+    measured_at: u32,
 }
 
 /// An accepted pose and its round.
@@ -95,7 +109,17 @@ impl<'a> Problem<'a> {
 impl<'a> State<'a> {
     pub(crate) fn new(problem: Problem<'a>, pool: Arc<Pool>, start: Instant) -> Self {
         let timings = Timings { prepare_s: start.elapsed().as_secs_f64(), ..Timings::default() };
-        Self { problem, rounds: Vec::new(), timings, pool, found: Vec::new(), start }
+        Self {
+            problem,
+            rounds: Vec::new(),
+            timings,
+            pool,
+            rounds_since_settling: 0,
+            candidates: Vec::new(),
+            found: Vec::new(),
+            last_found_at: 0,
+            start,
+        }
     }
 
     /// The poses accepted so far, in the order they were found.
@@ -129,35 +153,98 @@ impl<'a> State<'a> {
         if let Some(threshold) = params.max_instances.filter(|&limit| found >= limit) {
             return ControlFlow::Break(StopReason::MaxInstances { value: found, threshold });
         }
-        let rejections = self.rounds.iter().rev().take_while(|round| !round.accepted()).count() as u32;
+        let rejections = rounds - self.last_found_at;
         if let Some(threshold) = params.max_rejections.filter(|&limit| rejections >= limit) {
             return ControlFlow::Break(StopReason::MaxRejections { value: rejections, threshold });
         }
         self.problem.interrupt.check()
     }
 
-    /// Books a round: keeps its pose if it was accepted, removes and bars correspondences.
+    pub(crate) fn num_found(&self) -> u32 {
+        self.found.len() as u32
+    }
+
+    /// Books a round: removes or bars correspondences, enters the hypothesis for the contest if it passed.
     pub(crate) fn conclude(
         &mut self,
         params: &Params,
-        mut round: Round,
-        accepted: Option<Hypothesis>,
-        removed: &[u32],
-        barred: &[u32],
-    ) -> ControlFlow<StopReason, Round> {
-        let problem = &mut self.problem;
-        round.num_removed = problem.remove(removed);
-        round.num_barred = problem.bar(barred);
-        if let Some(hypothesis) = accepted {
-            let target_from_source = hypothesis.target_from_source;
-            problem.claim(params, &target_from_source);
-            self.found.push(Found { target_from_source, round: round.index });
+        seeds: &Ranked,
+        dense: &Ranked,
+        estimate: &Estimate,
+        verdict: Option<Verdict>,
+    ) {
+        let index = self.rounds.len() as u32;
+        let num_alive = self.problem.alive.ids().len() as u32;
+        let (removed, barred) = match params.removal {
+            Removal::Dense => (dense.ids(), &[][..]),
+            // After an acceptance too: the seeds may all lie outside of the pose that they led to.
+            Removal::Inliers => (&[][..], seeds.ids()),
+        };
+        self.rounds.push(Round {
+            index,
+            num_alive,
+            num_seeds: seeds.len() as u32,
+            num_dense: dense.len() as u32,
+            num_samples: estimate.num_samples,
+            num_degenerate: estimate.num_degenerate,
+            hypothesis_score: estimate.hypothesis.map(|h| h.score),
+            verdict,
+            num_removed: self.problem.remove(removed),
+            num_barred: self.problem.bar(barred),
+        });
+        self.rounds_since_settling += 1;
+        if let (Some(hypothesis), Some(verdict)) = (estimate.hypothesis, verdict.filter(Verdict::accepted)) {
+            let measured_at = self.num_found();
+            self.candidates.push(Candidate { hypothesis, value: verdict.value, round: index, measured_at });
         }
-        self.rounds.push(round.clone());
-        if round.num_removed + round.num_barred == 0 {
-            return ControlFlow::Break(StopReason::Stalled);
+    }
+
+    /// The round just booked, as it is after the contest, if there was one.
+    pub(crate) fn last_round(&self) -> ControlFlow<StopReason, Round> {
+        match self.rounds.last() {
+            Some(round) if round.num_removed + round.num_barred > 0 => ControlFlow::Continue(round.clone()),
+            _ => ControlFlow::Break(StopReason::Stalled),
         }
-        ControlFlow::Continue(round)
+    }
+
+    /// Validates again the candidates that were measured before the last instance claimed its points; drops
+    /// those that fail.
+    pub(crate) fn measure_candidates(&mut self, params: &Params, hv: &dyn Validate) {
+        let now = self.num_found();
+        let mut candidates = std::mem::take(&mut self.candidates);
+        candidates.retain_mut(|candidate| {
+            if candidate.measured_at < now {
+                let context = self.problem.context(params, candidate.round as usize);
+                let verdict = hv.validate(&context, &candidate.hypothesis);
+                (candidate.value, candidate.measured_at) = (verdict.value, now);
+                return verdict.accepted();
+            }
+            true
+        });
+        self.candidates = candidates;
+    }
+
+    /// Makes an instance of the best candidate, the earlier of equals, if its value is at least `least`; returns
+    /// the value.
+    pub(crate) fn accept_best(&mut self, params: &Params, least: f64) -> Option<f64> {
+        let order = |a: &Candidate, b: &Candidate| a.value.total_cmp(&b.value).then(b.round.cmp(&a.round));
+        let (at, _) = self.candidates.iter().enumerate().max_by(|(_, a), (_, b)| order(a, b))?;
+        if self.candidates[at].value < least {
+            return None;
+        }
+        let Candidate { hypothesis, value, round, .. } = self.candidates.remove(at);
+        let target_from_source = hypothesis.target_from_source;
+        if params.removal == Removal::Inliers {
+            let spent = self.problem.context(params, round as usize).spent(&target_from_source);
+            let num_removed = self.problem.remove(&spent);
+            if let Some(last) = self.rounds.last_mut() {
+                last.num_removed += num_removed;
+            }
+        }
+        self.problem.claim(params, &target_from_source);
+        self.found.push(Found { target_from_source, round });
+        self.last_found_at = self.rounds.len() as u32;
+        Some(value)
     }
 
     /// The result: poses measured and ranked, correspondences labelled.
