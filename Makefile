@@ -43,6 +43,7 @@ bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac pi
 tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables and write benchmarks/records (needs Open3D)
 	$(BIN)/python benchmarks/symmetry.py examples/models
 	$(BIN)/python benchmarks/ecc_layout.py
+	$(BIN)/python benchmarks/outlier_layout.py
 
 .PHONY: lint
 lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs

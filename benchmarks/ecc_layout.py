@@ -46,7 +46,9 @@ def main() -> None:
     scenes = [synth.ecc_layout(seed, shapes=clouds) for seed in SCENES]
     k = np.mean([scene.num_instances for scene in scenes])
     inliers = np.mean([scene.inlier_ratio() for scene in scenes])
-    print(f"{len(scenes)} scenes of {len(clouds)} shapes, K {k:.1f}, inliers {inliers:.1%}, {platform.machine()}")
+    print(
+        f"{len(scenes)} scenes of {len(clouds)} shapes, K {k:.1f}, inliers {inliers:.1%}, {platform.machine()}"
+    )
     print(f"{'preset':40s}  MHR   MHP   MHF1  +-    ms")
     record = ROOT / "benchmarks/records/ecc_layout.csv"
     with record.open("w", newline="", encoding="utf-8") as file:
@@ -62,7 +64,9 @@ def main() -> None:
                     seconds.append(found.timings.total_s)
                     scores.append(score)
                     rates = [f"{rate:.4f}" for rate in (score.recall, score.precision, score.f1)]
-                    out.writerow([ibi.__version__, name, sampler_seed, scene.name, scene.num_instances, *rates])
+                    out.writerow(
+                        [ibi.__version__, name, sampler_seed, scene.name, scene.num_instances, *rates]
+                    )
                 means.append(metrics.mean_score(scores))
             mhr, mhp, mhf1 = (np.mean([getattr(m, key) for m in means]) for key in ("mhr", "mhp", "mhf1"))
             spread = np.std([m.mhf1 for m in means])

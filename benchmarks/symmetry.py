@@ -54,8 +54,12 @@ def fit(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def main() -> None:
     """Run over a folder."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, nargs="?", help="folder of PLY meshes; default: the built-in shapes")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "folder", type=Path, nargs="?", help="folder of PLY meshes; default: the built-in shapes"
+    )
     folder = parser.parse_args().folder
     paths = sorted(folder.glob("*.ply")) if folder else []
     clouds = {path.name: synth.sample_mesh(path, 3400, np.random.default_rng(0))[0] for path in paths}
@@ -65,7 +69,10 @@ def main() -> None:
     for name, points in clouds.items():
         value, angle = deviation(points)
         symmetric[name] = value < THRESHOLD
-        print(f"{name:28s} {value:.3f} radii at {angle:3.0f} degrees {'symmetric' * symmetric[name]}", flush=True)
+        print(
+            f"{name:28s} {value:.3f} radii at {angle:3.0f} degrees {'symmetric' * symmetric[name]}",
+            flush=True,
+        )
     if folder:
         index = folder / "index.json"
         entries = json.loads(index.read_text(encoding="utf-8"))

@@ -276,7 +276,7 @@ class Params:
     --------
     >>> import ibi_rs as ibi
     >>> ibi.Params(hv=ibi.Overlap(t_overlap=0.35), t_he_pr=2).hv
-    Overlap(t_overlap=0.35)
+    Overlap(t_overlap=0.35, exclusive=False)
     """
 
     seed: int = 0

@@ -146,7 +146,7 @@ impl Params {
             te: Irls::default().into(),
             refine: Refine::Icp,
             hv: Overlap { t_overlap: 0.35, exclusive: true }.into(),
-            n_contest: 60,
+            n_contest: 100,
             removal: Removal::Inliers,
             max_rejections: Some(150),
             ..Self::paper_synthetic()
