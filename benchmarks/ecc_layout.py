@@ -1,4 +1,4 @@
-"""The ECC layout: the paper preset with either payoff, on 16 seeded scenes. Prints a table, records each scene.
+"""The ECC layout: the paper preset with either payoff, on 16 seeded scenes. Prints a table, records scenes.
 
     python benchmarks/ecc_layout.py            # or: make tables
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import platform
 from pathlib import Path
 
@@ -46,9 +47,8 @@ def main() -> None:
     scenes = [synth.ecc_layout(seed, shapes=clouds) for seed in SCENES]
     k = np.mean([scene.num_instances for scene in scenes])
     inliers = np.mean([scene.inlier_ratio() for scene in scenes])
-    print(
-        f"{len(scenes)} scenes of {len(clouds)} shapes, K {k:.1f}, inliers {inliers:.1%}, {platform.machine()}"
-    )
+    print(f"{len(scenes)} scenes of {len(clouds)} shapes, K {k:.1f}, inliers {inliers:.1%}")
+    print(f"{os.cpu_count()} cores, {platform.machine()}")
     print(f"{'preset':40s}  MHR   MHP   MHF1  +-    ms")
     record = ROOT / "benchmarks/records/ecc_layout.csv"
     with record.open("w", newline="", encoding="utf-8") as file:

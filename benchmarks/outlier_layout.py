@@ -1,9 +1,9 @@
-"""The outlier layout: 5000 correspondences, 20 instances, by outlier ratio. Prints a table, records each scene.
+"""The outlier layout: 5000 correspondences, 20 instances, by outlier ratio. Prints a table, records scenes.
 
     python benchmarks/outlier_layout.py            # or: make tables
 
-Metric: one to one, 20 degrees, 0.5 radii. The time is the median over the scenes of a whole registration, with as
-many threads as there are cores.
+Metric: one to one, 20 degrees, 0.5 radii. The time is the median over the scenes of a whole registration, with
+as many threads as there are cores.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Says which shapes look the same after a turn: they cannot be scored by a rotation error.
 
-For each mesh of a folder (or each built-in shape) it searches, over random rotations polished by ICP, the motion
-other than the identity (more than 20 degrees away, ECC's threshold) that leaves the least deviation: the root
+For each mesh of a folder (or each built-in shape) it searches, over random rotations polished by ICP, the
+motion other than the identity (more than 20 degrees away, ECC's threshold) that leaves the least deviation: the root
 mean square distance to the nearest point of the shape, less what the sampling itself causes, in radii of the
 shape. Below 0.03 radii, well under the jitter and spacing of a 256-point sample, it counts as symmetric.
 
@@ -45,7 +45,7 @@ def deviation(points: np.ndarray, starts: int = 300) -> tuple[float, float]:
 
 
 def fit(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rigid motion of least squares."""
+    """Return the rigid motion of least squares."""
     p, q = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - q).T @ (source - p))
     turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt

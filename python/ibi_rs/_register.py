@@ -49,13 +49,13 @@ def register(
     params : Params, optional
         Default ``Params()``.
     src_normals, tgt_normals : (N, 3) array_like, optional
-        Normals of both clouds, or of neither; any length but 0. Used by the local game (``LocalGtm``) and, where
-        ``min_normal_cos`` is set, by inliers, refinement and overlap; :meth:`Params.single_view` does both.
+        Normals of both clouds, or of neither; any length but 0. Used by the local game (``LocalGtm``) and,
+        where ``min_normal_cos`` is set, by inliers, refinement and overlap: :meth:`Params.single_view`.
     similarity : (M,) array_like, optional
         How alike the two descriptors of each correspondence are; larger is better. No variant uses it yet.
     viewpoint : (3,) array_like, optional
-        Where the depth camera stood, in the frame of ``tgt``. With normals that count, only source points that
-        face it count in the overlap.
+        Where the depth camera stood, in the frame of ``tgt``. With normals that count, only source points
+        that face it count in the overlap.
     num_threads : int, optional
         Default: the environment variable ``IBI_NUM_THREADS``, else the cores the process may use. The result
         does not depend on it.

@@ -252,8 +252,8 @@ class Params:
         How a hypothesis is polished on the clouds before it is validated: ``"none"``, or ``"icp"``, iterative
         closest points, point-to-plane where normals count.
     n_contest
-        A contest lasts this many rounds: at its end the hypotheses that passed validation become instances, best
-        value first. 1: each at once, as it is found. At least 1.
+        A contest lasts this many rounds: at its end the hypotheses that passed validation become instances,
+        best value first. 1: each at once, as it is found. At least 1.
     removal
         Which correspondences a round removes; ``"dense"``: those that the enhancement ranked; ``"inliers"``:
         those within 2 ``t_he`` of an accepted pose and those whose target point it explains, while the seeds
@@ -326,9 +326,10 @@ class Params:
     def single_view(cls: type[_P]) -> _P:
         """Return the setting for a scene seen by one depth camera.
 
-        Give the normals of both clouds, oriented, and the viewpoint. Not of the paper: all correspondences play,
-        one neighbourhood at a time, and a hypothesis is polished on the clouds before its overlap with the scene
-        points that no other instance explains is measured, over the source points that face the camera.
+        Give the normals of both clouds, oriented, and the viewpoint. Not of the paper: all correspondences
+        play, one neighbourhood at a time; a hypothesis is polished on the clouds before its overlap is
+        measured, over the source points that face the camera, with the scene points that no other instance
+        explains; and hypotheses compete before one becomes an instance.
         """
         return cls.from_dict(json.loads(_core.preset("single_view")))
 

@@ -131,9 +131,9 @@ impl Params {
 
     /// For a scene seen by one depth camera. Give the normals of both clouds, oriented, and the viewpoint.
     ///
-    /// Not of the paper: all correspondences play, one neighbourhood at a time, and a hypothesis is polished on
-    /// the clouds before its overlap with the scene points that no other instance explains is measured, over the
-    /// source points that face the camera.
+    /// Not of the paper: all correspondences play, one neighbourhood at a time; a hypothesis is polished on the
+    /// clouds before its overlap is measured, over the source points that face the camera, with the scene points
+    /// that no other instance explains; and hypotheses compete before one becomes an instance.
     #[must_use]
     pub fn single_view() -> Self {
         Self {

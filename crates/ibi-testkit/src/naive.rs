@@ -1,6 +1,6 @@
 //! The kernels once more, in `f64`, written as their definitions read: no lanes, no trees, no early exits.
 
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Translation3, UnitQuaternion, Vector3};
 
 /// One correspondence: (source point, target point).
 pub type Pair = (Point3<f64>, Point3<f64>);
@@ -177,4 +177,56 @@ pub fn triangle_height(a: &Point3<f64>, b: &Point3<f64>, c: &Point3<f64>) -> f64
         (w - along * w.dot(&along)).norm()
     };
     to_line(a, b, c).min(to_line(b, c, a)).min(to_line(c, a, b))
+}
+
+/// What joins two correspondences in the compatibility graph, in data units.
+#[derive(Debug, Clone, Copy)]
+pub struct EdgeTest {
+    /// The rigidity stays below this.
+    pub tau: f64,
+    /// Both lengths exceed this.
+    pub min_length: f64,
+    /// The length on the target's side stays below this.
+    pub max_length: f64,
+    /// How far the cosines of [`angles`] may differ between the sides.
+    pub normal_tolerance: f64,
+}
+
+/// By how much the lengths between i and j pass the test: they are joined where
+/// this is positive.
+#[must_use]
+pub fn edge_margin(i: &Pair, j: &Pair, test: &EdgeTest) -> f64 {
+    let (a, b) = ((i.0 - j.0).norm(), (i.1 - j.1).norm());
+    [test.tau - (a - b).abs(), a - test.min_length, b - test.min_length, test.max_length - b]
+        .into_iter()
+        .fold(f64::INFINITY, f64::min)
+}
+
+/// w = 1 - (r / `tau`)^2.
+#[must_use]
+pub fn edge_weight(i: &Pair, j: &Pair, tau: f64) -> f64 {
+    1.0 - (((i.0 - j.0).norm() - (i.1 - j.1).norm()) / tau).powi(2)
+}
+
+/// The cosines between two oriented points: normal and normal, each normal and the line that joins them.
+#[must_use]
+pub fn angles(a: (&Point3<f64>, &Vector3<f64>), b: (&Point3<f64>, &Vector3<f64>)) -> [f64; 3] {
+    let along = (b.0 - a.0).normalize();
+    [a.1.dot(b.1), a.1.dot(&along), b.1.dot(&along)]
+}
+
+/// Outward normals of a closed surface around the origin: across the plane of each point and its eight nearest.
+#[must_use]
+pub fn outward_normals(points: &[Point3<f64>]) -> Vec<Vector3<f64>> {
+    let normal = |p: &Point3<f64>| {
+        let mut around: Vec<Vector3<f64>> = points.iter().map(|q| q - p).collect();
+        around.sort_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()));
+        around.truncate(9);
+        let mean = around.iter().sum::<Vector3<f64>>() / around.len() as f64;
+        let spread: Matrix3<f64> = around.iter().map(|d| (d - mean) * (d - mean).transpose()).sum();
+        let eigen = spread.symmetric_eigen();
+        let across = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
+        across * across.dot(&p.coords).signum()
+    };
+    points.iter().map(normal).collect()
 }
