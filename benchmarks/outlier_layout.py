@@ -2,8 +2,8 @@
 
     python benchmarks/outlier_layout.py            # or: make tables
 
-Metric: one to one, 20 degrees, 0.5 radii. The time is the median over the scenes of a whole registration, with
-as many threads as there are cores.
+Metric: one to one, 20 degrees, 0.5 radii. The time is the median over the scenes of a whole registration,
+with as many threads as there are cores.
 """
 
 from __future__ import annotations

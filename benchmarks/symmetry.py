@@ -1,9 +1,9 @@
 """Says which shapes look the same after a turn: they cannot be scored by a rotation error.
 
 For each mesh of a folder (or each built-in shape) it searches, over random rotations polished by ICP, the
-motion other than the identity (more than 20 degrees away, ECC's threshold) that leaves the least deviation: the root
-mean square distance to the nearest point of the shape, less what the sampling itself causes, in radii of the
-shape. Below 0.03 radii, well under the jitter and spacing of a 256-point sample, it counts as symmetric.
+motion more than 20 degrees (ECC's threshold) from the identity that leaves the least deviation: the root mean
+square distance to the nearest point of the shape, less what the sampling itself causes, in radii of the shape.
+Below 0.03 radii, well under the spacing of a 256-point sample, it counts as symmetric.
 
     python benchmarks/symmetry.py examples/models     # prints the table, writes symmetric into its index.json
 """

@@ -3,9 +3,9 @@
     make demo                             # or: python examples/demo.py --scene multi
 
 The scans and the models are shipped beside this file (Apache-2.0, see the README in each folder). The
-correspondences are real descriptor matches, 4 to 9 % of them right, made once by make_matches.py. Each scan is
-of one view: at most half of a part can be seen, so the preset `single_view` counts overlap over the model points
-that face the camera, and asks for 0.35 of them.
+correspondences are real descriptor matches, 4 to 9 % of them right, made once by make_matches.py. Each scan
+is of one view: at most half of a part can be seen, so the preset `single_view` counts overlap over the model
+points that face the camera, and asks for 0.35 of them.
 """
 
 from __future__ import annotations
@@ -69,10 +69,8 @@ def show(scene: str, out: Path) -> None:
         )
     print()
     seconds = found.timings.total_s
-    print(
-        f"{len(found)} parts in {seconds:.2f} s; {len(reached)} of {len(labelled)} labels reached (ADD-S below"
-    )
-    print(f"0.1 diameters); stopped by {found.stop_reason}")
+    print(f"{len(found)} parts in {seconds:.2f} s; stopped by {found.stop_reason};")
+    print(f"{len(reached)} of {len(labelled)} labels reached (ADD-S below 0.1 diameters)")
 
     out.mkdir(parents=True, exist_ok=True)
     picture = out / f"{scene}.png"
