@@ -2,8 +2,8 @@
 
 For each mesh of a folder (or each built-in shape) it searches, over random rotations polished by ICP, the
 motion more than 20 degrees (ECC's threshold) from the identity that leaves the least deviation: the root mean
-square distance to the nearest point of the shape, less what the sampling itself causes, in radii of the shape.
-Below 0.03 radii, well under the spacing of a 256-point sample, it counts as symmetric.
+square distance to the nearest point of the shape, less what the sampling itself causes, in radii of the
+shape. Below 0.03 radii, well under the spacing of a 256-point sample, it counts as symmetric.
 
     python benchmarks/symmetry.py examples/models     # prints the table, writes symmetric into its index.json
 """
