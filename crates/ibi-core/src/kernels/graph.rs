@@ -5,6 +5,8 @@
 //! correspondence with it, so each edge is weighed by what its ends have in common: second order (Chen et al.
 //! 2022, SC2-PCR). No edge is longer than the model, which makes the graph local: cost grows with the scene.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use nalgebra::{Isometry3, Vector3};
 
 use super::columns::Columns;
@@ -35,13 +37,15 @@ pub struct PairNormals {
 
 /// Compressed rows: the neighbours of each correspondence, ascending, and the second-order weight of the edge;
 /// which correspondences are alive, and the support of each: the sum of its weights to the alive ones.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 pub struct Graph {
     starts: Vec<usize>,
     neighbors: Vec<u32>,
     weights: Vec<f32>,
     alive: Vec<bool>,
     support: Vec<f32>,
+    /// Set through a shared reference, by one thread at a time: the stage that plays the neighbourhoods.
+    futile: Vec<AtomicBool>,
 }
 
 impl Graph {
@@ -60,6 +64,7 @@ impl Graph {
         let mut graph = Self::first_order(pairs, normals, test, &interrupted);
         graph.weights = graph.second_order(&interrupted);
         graph.alive = vec![true; graph.len()];
+        graph.futile = (0..graph.len()).map(|_| AtomicBool::new(false)).collect();
         graph.support = par::map(graph.len(), 64, |i| graph.supported(i as u32));
         graph
     }
@@ -76,7 +81,19 @@ impl Graph {
         let support = par::map(touched.len(), 64, |t| self.supported(touched[t]));
         for (&i, support) in touched.iter().zip(support) {
             self.support[i as usize] = support;
+            *self.futile[i as usize].get_mut() = false;
         }
+    }
+
+    /// Remembers that the neighbourhood of i came to nothing, until one of its members is removed.
+    pub fn set_futile(&self, i: u32) {
+        self.futile[i as usize].store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the neighbourhood of i came to nothing and has not changed since.
+    #[must_use]
+    pub fn is_futile(&self, i: u32) -> bool {
+        self.futile[i as usize].load(Ordering::Relaxed)
     }
 
     /// Whether i is alive.

