@@ -193,10 +193,16 @@ impl<'a> Registrar<'a> {
         let pool = Arc::clone(&state.pool);
         pool.install(|| {
             loop {
-                match self.round(state) {
-                    // Candidates still waiting may free the way for further rounds.
+                let played = state.rounds.len();
+                let flow = self.round(state);
+                // Where the rounds run dry, candidates still waiting may free the way for further ones.
+                match flow {
                     ControlFlow::Break(reason) if reason.is_dry() && self.settle(state) > 0 => {}
                     flow => return flow,
+                }
+                // A round that was played to its end is reported, although it would have ended the run.
+                if let Some(round) = state.rounds.get(played) {
+                    return ControlFlow::Continue(round.clone());
                 }
             }
         })
@@ -253,7 +259,7 @@ impl<'a> Registrar<'a> {
     pub fn finish(&self, mut state: State<'_>, stop_reason: StopReason) -> Registration {
         let pool = Arc::clone(&state.pool);
         pool.install(|| {
-            self.settle(&mut state);
+            while self.settle(&mut state) > 0 {}
             state.into_registration(&self.params, stop_reason)
         })
     }

@@ -406,3 +406,11 @@ fn single_view_finds_every_instance_whatever_the_threads() {
 fn single_view_with_gsac_finds_every_instance_whatever_the_threads() {
     check_single_view(&Params { te: Gsac::default().into(), ..Params::single_view() });
 }
+
+#[test]
+fn finish_accepts_every_candidate_that_still_passes() {
+    // The last is far below the best, so that one settling leaves it for a contest that never comes.
+    let plan: Plan = &[(0, 0.4), (20, 1.0), (40, 0.6), (60, 0.7)];
+    let result = register(&planned(plan, Params { max_rounds: Some(4), ..endless() }));
+    assert_eq!(sorted_places(&result), [0, 20, 40, 60]);
+}

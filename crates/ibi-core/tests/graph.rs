@@ -133,7 +133,8 @@ proptest! {
 
     #[test]
     fn graph_survives_rigid_motion_of_either_side(
-        (pairs, (n, m)) in oriented(1..40), test in tests(), one in rigid_motions(1e3), other in rigid_motions(1e3),
+        (pairs, (n, m)) in oriented(1..40), test in tests(),
+        one in rigid_motions(1e3), other in rigid_motions(1e3),
     ) {
         let moved: Vec<Pair> = pairs.iter().map(|(p, q)| (one * p, other * q)).collect();
         let turned = (n.iter().map(|n| one * n).collect(), m.iter().map(|m| other * m).collect());

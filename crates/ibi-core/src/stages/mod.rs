@@ -40,7 +40,8 @@ pub trait EstimatePose: Send + Sync {
 
 /// HV: holds the pose against the two clouds.
 pub trait Validate: Send + Sync {
-    /// Accepted or rejected, with the measured value.
+    /// Accepted or rejected, with the measured value. Asked again at the end of a contest, also after the run was
+    /// interrupted: unlike the other stages it must then still answer truly.
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict;
 }
 
