@@ -250,7 +250,8 @@ class Params:
         hypothesis validation.
     refine
         How a hypothesis is polished on the clouds before it is validated: ``"none"``, or ``"icp"``, iterative
-        closest points, point-to-plane where normals count.
+        closest points, point-to-plane where normals count; a hypothesis that fewer than ``t_s``
+        correspondences agree with afterwards is dropped.
     n_contest
         A contest lasts this many rounds: at its end the hypotheses that passed validation become instances,
         best value first. 1: each at once, as it is found. At least 1.

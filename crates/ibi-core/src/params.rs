@@ -67,7 +67,8 @@ pub enum Refine {
     #[default]
     None,
     /// Iterative closest points within 2 `d_op`: point-to-plane where `min_normal_cos` lets normals count,
-    /// else point-to-point.
+    /// else point-to-point. A hypothesis that fewer than `t_s` alive correspondences agree with afterwards is
+    /// dropped.
     Icp,
 }
 

@@ -221,10 +221,7 @@ impl<'a> Registrar<'a> {
         }
         let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
         let mut estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
-        if let Some(hypothesis) = &mut estimate.hypothesis {
-            let pose = &mut hypothesis.target_from_source;
-            *pose = timed(&mut times.refine_s, || context.scene.refined(&self.params, pose));
-        }
+        estimate.hypothesis = timed(&mut times.refine_s, || context.refined(estimate.hypothesis?));
         let verdict = estimate
             .hypothesis
             .map(|hypothesis| timed(&mut times.hv_s, || self.hv().validate(&context, &hypothesis)));

@@ -10,7 +10,8 @@ use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector
 use ibi_core::stages::hv::Overlap;
 use ibi_core::stages::scs::LocalGtm;
 use ibi_core::stages::te::Irls;
-use ibi_core::{Cloud, Correspondences, Params, Registrar, Removal};
+use ibi_core::stages::{Context, Estimate, EstimatePose, Hypothesis, Ranked};
+use ibi_core::{Cloud, Correspondences, Params, Refine, Registrar, Removal};
 use ibi_testkit::Rng;
 use ibi_testkit::naive;
 use ibi_testkit::scenes::asymmetric_model;
@@ -356,4 +357,35 @@ fn coincident_instances_are_found_once_if_scene_points_are_exclusive() {
     }
     // Both runs entered the same hypotheses for their first contest.
     assert_eq!(once.rounds[..2].iter().filter(|round| round.accepted()).count(), 2);
+}
+
+// ------------------------------------------------------------------------------- support after the refinement
+
+/// A transformation estimation that always answers with one pose.
+struct Fixed(Isometry3<f64>);
+
+impl EstimatePose for Fixed {
+    fn estimate_pose(&self, _: &Context<'_>, _: &Ranked) -> Estimate {
+        let hypothesis = Hypothesis { target_from_source: self.0, score: 1.0 };
+        Estimate { hypothesis: Some(hypothesis), num_samples: 1, num_degenerate: 0 }
+    }
+}
+
+#[test]
+fn a_pose_that_no_correspondence_agrees_with_is_dropped_although_the_clouds_fit() {
+    let source = asymmetric_model(200);
+    let (near, far) = (Isometry3::translation(4.0, 0.0, 0.0), Isometry3::translation(-4.0, 0.0, 0.0));
+    let target: Vec<_> = [near, far].iter().flat_map(|pose| source.iter().map(move |p| pose * p)).collect();
+    // Only the first copy has correspondences.
+    let correspondences = Correspondences::from_rows((0..200).map(|row| [row, row]).collect());
+    let found = |pose, refine| {
+        let params = Params { refine, max_rounds: Some(1), ..Params::default() };
+        let registrar = Registrar::new(&Cloud::new(&source)).unwrap().params(params).with_te(Fixed(pose));
+        registrar.register(&Cloud::new(&target), &correspondences).unwrap()
+    };
+    assert_eq!(found(near, Refine::Icp).poses.len(), 1);
+    let dropped = found(far, Refine::Icp);
+    assert!(dropped.poses.is_empty() && dropped.rounds[0].verdict.is_none());
+    // Without refinement there is nothing to be carried away by, and overlap alone decides, as in the paper.
+    assert_eq!(found(far, Refine::None).poses.len(), 1);
 }

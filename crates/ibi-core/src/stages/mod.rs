@@ -17,7 +17,7 @@ use crate::interrupt::Interrupt;
 use crate::kernels::graph::Graph;
 use crate::kernels::mae::close_pairs;
 use crate::kernels::rng::Rng;
-use crate::params::Params;
+use crate::params::{Params, Refine};
 use crate::scene::Scene;
 
 /// SCS: picks from the alive correspondences a few that are highly consistent with each other.
@@ -102,6 +102,20 @@ impl Context<'_> {
         spent.sort_unstable();
         spent.dedup();
         spent
+    }
+
+    /// The hypothesis polished on the clouds, as the parameters want it. `None` if that has carried it away from
+    /// its correspondences, so that fewer than `t_s` alive ones still agree: the clouds alone fit flat faces
+    /// almost anywhere.
+    #[must_use]
+    pub fn refined(&self, hypothesis: Hypothesis) -> Option<Hypothesis> {
+        if self.params.refine == Refine::None {
+            return Some(hypothesis);
+        }
+        let target_from_source = self.scene.refined(self.params, &hypothesis.target_from_source);
+        let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
+        let is_supported = support >= self.params.t_s as usize;
+        is_supported.then_some(Hypothesis { target_from_source, ..hypothesis })
     }
 
     /// The random stream of `stage` in this round, and no other's.

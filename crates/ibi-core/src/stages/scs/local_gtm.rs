@@ -55,9 +55,15 @@ impl LocalGtm {
             max_length: (diameter_pr + self.tau_pr) as f32,
             normal_tolerance: self.normal_tolerance as f32,
         };
-        Graph::new(&context.pairs.columns, context.pairs.normals.as_ref(), &test, || {
-            context.interrupt.is_set()
-        })
+        let interrupted = || context.interrupt.is_set();
+        let mut graph =
+            Graph::new(&context.pairs.columns, context.pairs.normals.as_ref(), &test, interrupted);
+        // In the first round everything is alive; a stage of the user's may have begun the run, though.
+        if context.alive.ids().len() < graph.len() {
+            let is_dead = |id: &u32| context.alive.ids().binary_search(id).is_err();
+            graph.remove(&(0..graph.len() as u32).filter(is_dead).collect::<Vec<_>>());
+        }
+        graph
     }
 
     /// The seeds among `leader` and its alive neighbours.
