@@ -3,7 +3,7 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import metrics, synth
+from ibi_rs import metrics, plot, synth
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._register import register
 from ibi_rs.params import Gsac, Gtm, InlierCount, Irls, LocalGtm, None_, Off, Overlap, Params, Ransac, Voting
@@ -31,6 +31,7 @@ __all__ = [
     "Voting",
     "__version__",
     "metrics",
+    "plot",
     "register",
     "synth",
 ]
