@@ -257,8 +257,8 @@ class Params:
         best value first. 1: each at once, as it is found. At least 1.
     removal
         Which correspondences a round removes; ``"dense"``: those that the enhancement ranked; ``"inliers"``:
-        those within 2 ``t_he`` of an accepted pose and those whose target point it explains, while the seeds
-        of a rejected one may not lead again.
+        those within 2 ``t_he`` of an accepted instance and those whose target point it explains, while the
+        seeds of a round, accepted or not, may not lead again.
     max_rejections, max_rounds, max_instances
         A run ends after so many rounds without a new instance, rounds, or instances; None: no limit.
     timeout_s

@@ -81,8 +81,8 @@ pub enum Removal {
     // PAPER: the text removes C_d after a rejection too; its pseudocode does not, and can loop for ever.
     #[default]
     Dense,
-    /// After an acceptance, the alive correspondences within 2 `t_he` of the pose and those whose target point
-    /// it explains; after a rejection, none, but its seeds may not lead again.
+    /// When an instance is accepted, the alive correspondences within 2 `t_he` of it and those whose target point
+    /// it explains. The seeds of a round, accepted or not, may not lead again.
     Inliers,
 }
 

@@ -153,7 +153,7 @@ impl std::fmt::Display for StopReason {
                 write!(f, "few_correspondences: {value} alive, {threshold} needed")
             }
             Self::MaxRejections { value, threshold } => {
-                write!(f, "max_rejections: {value} of {threshold} in a row")
+                write!(f, "max_rejections: {value} of {threshold} rounds without a new instance")
             }
             Self::MaxRounds { value, threshold } => write!(f, "max_rounds: {value} of {threshold} played"),
             Self::MaxInstances { value, threshold } => {

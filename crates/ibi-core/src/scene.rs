@@ -1,6 +1,7 @@
 //! The two clouds and what is known of them: points, normals, viewpoint, kd-trees, resolution.
 
 use std::borrow::Cow;
+use std::sync::OnceLock;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
@@ -10,7 +11,7 @@ use crate::kernels::neighbors::Neighbors;
 use crate::kernels::overlap::{Contact, Place, Surface, places};
 use crate::kernels::par;
 use crate::metrics::diameter;
-use crate::params::{Params, Refine};
+use crate::params::Params;
 
 /// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
 #[derive(Debug, Clone, Default)]
@@ -69,8 +70,7 @@ pub struct PreparedCloud<'a> {
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
     pub extent: f64,
-    /// Largest distance of two points, in data units; of the source only (0 for a target).
-    pub diameter: f64,
+    diameter: OnceLock<f64>,
 }
 
 impl<'a> PreparedCloud<'a> {
@@ -105,12 +105,18 @@ impl<'a> PreparedCloud<'a> {
             neighbors,
             spacing,
             extent,
-            diameter: if argument == Argument::Src { diameter(points) } else { 0.0 },
+            diameter: OnceLock::new(),
         })
     }
 }
 
 impl PreparedCloud<'_> {
+    /// Largest distance of two points, in data units; measured when first asked for.
+    #[must_use]
+    pub fn diameter(&self) -> f64 {
+        *self.diameter.get_or_init(|| diameter(&self.points))
+    }
+
     fn surface(&self, oriented: bool) -> Surface<'_> {
         Surface { points: &self.points, normals: self.normals.as_deref().filter(|_| oriented) }
     }
@@ -133,19 +139,10 @@ impl<'a> Scene<'a> {
         target: PreparedCloud<'a>,
         resolution: Option<f64>,
     ) -> Result<Self, Error> {
+        let (src, tgt) = (Argument::SrcNormals, Argument::TgtNormals);
         match (&source.normals, &target.normals) {
-            (Some(_), None) => {
-                return Err(Error::NormalsOfOneCloud {
-                    given: Argument::SrcNormals,
-                    missing: Argument::TgtNormals,
-                });
-            }
-            (None, Some(_)) => {
-                return Err(Error::NormalsOfOneCloud {
-                    given: Argument::TgtNormals,
-                    missing: Argument::SrcNormals,
-                });
-            }
+            (Some(_), None) => return Err(Error::NormalsOfOneCloud { given: src, missing: tgt }),
+            (None, Some(_)) => return Err(Error::NormalsOfOneCloud { given: tgt, missing: src }),
             _ => {}
         }
         // Metres against millimetres would make pr so coarse that a whole cloud fits into one point, and any
@@ -185,25 +182,20 @@ impl Scene<'_> {
     ) -> Vec<bool> {
         let d_op = params.d_op_pr * self.resolution;
         let source_from_target = target_from_source.inverse();
-        let (centre, radius) = (self.source.points[0], self.source.diameter + d_op);
+        let (centre, radius) = (self.source.points[0], self.source.extent + d_op);
         par::map(points.len(), 256, |i| {
             let back = source_from_target * points[i];
-            // Far points need no search: none is farther from the first source point than the diameter.
+            // Far points need no search: no source point is farther from the first than the extent.
             (back - centre).norm_squared() <= radius * radius
                 && self.source.neighbors.nearest(&back).is_some_and(|(_, dist_sq)| dist_sq <= d_op * d_op)
         })
     }
 
-    /// The pose polished on the two clouds, as the parameters want it.
+    /// The pose polished on the two clouds by ICP within 2 `d_op`.
     #[must_use]
-    pub fn refined(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
-        match params.refine {
-            Refine::None => *target_from_source,
-            Refine::Icp => {
-                let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-                icp(&source, &target, &self.target.neighbors, target_from_source, &contact, ICP_STEPS)
-            }
-        }
+    pub fn icp(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
+        let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        icp(&source, &target, &self.target.neighbors, target_from_source, &contact, ICP_STEPS)
     }
 
     fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact) {

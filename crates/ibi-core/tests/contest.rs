@@ -7,46 +7,20 @@
     reason = "tests may panic, and compare what is exact"
 )]
 
+mod common;
+
 use std::ops::ControlFlow;
 use std::time::Duration;
 
+use common::Mock;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::stages::te::Gsac;
-use ibi_core::stages::{
-    Context, Enhance, Estimate, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict,
-};
+use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Verdict};
 use ibi_core::{
     CancelToken, Cloud, Correspondences, Params, Registrar, Registration, Removal, Round, State, StopReason,
 };
 use ibi_testkit::scenes::asymmetric_model;
 use ibi_testkit::{Rng, naive};
-
-/// A stage that is a closure.
-struct Mock<F>(F);
-
-impl<F: Fn(&Context<'_>) -> Ranked + Send + Sync> SelectSeeds for Mock<F> {
-    fn select_seeds(&self, context: &Context<'_>) -> Ranked {
-        (self.0)(context)
-    }
-}
-
-impl<F: Fn(&Context<'_>, &Ranked) -> Ranked + Send + Sync> Enhance for Mock<F> {
-    fn enhance(&self, context: &Context<'_>, seeds: &Ranked) -> Ranked {
-        (self.0)(context, seeds)
-    }
-}
-
-impl<F: Fn(&Context<'_>, &Ranked) -> Estimate + Send + Sync> EstimatePose for Mock<F> {
-    fn estimate_pose(&self, context: &Context<'_>, dense: &Ranked) -> Estimate {
-        (self.0)(context, dense)
-    }
-}
-
-impl<F: Fn(&Context<'_>, &Hypothesis) -> Verdict + Send + Sync> Validate for Mock<F> {
-    fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        (self.0)(context, hypothesis)
-    }
-}
 
 /// The model is 10 points in a row, 1 apart; the scene is 100. Placed at x, it explains rows x to x + 9.
 const MODEL: usize = 10;

@@ -1,45 +1,19 @@
 //! The loop itself, with stages that are mocks: what it calls, removes, records, and when it ends.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
+mod common;
+
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use common::Mock;
 use ibi_core::nalgebra::{Isometry3, Point3};
-use ibi_core::stages::{
-    Context, Enhance, Estimate, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict,
-};
+use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Verdict};
 use ibi_core::{
     CancelToken, Cloud, Correspondences, Params, Registrar, Registration, Removal, Round, StopReason,
 };
-
-/// A stage that is a closure.
-struct Mock<F>(F);
-
-impl<F: Fn(&Context<'_>) -> Ranked + Send + Sync> SelectSeeds for Mock<F> {
-    fn select_seeds(&self, context: &Context<'_>) -> Ranked {
-        (self.0)(context)
-    }
-}
-
-impl<F: Fn(&Context<'_>, &Ranked) -> Ranked + Send + Sync> Enhance for Mock<F> {
-    fn enhance(&self, context: &Context<'_>, seeds: &Ranked) -> Ranked {
-        (self.0)(context, seeds)
-    }
-}
-
-impl<F: Fn(&Context<'_>, &Ranked) -> Estimate + Send + Sync> EstimatePose for Mock<F> {
-    fn estimate_pose(&self, context: &Context<'_>, dense: &Ranked) -> Estimate {
-        (self.0)(context, dense)
-    }
-}
-
-impl<F: Fn(&Context<'_>, &Hypothesis) -> Verdict + Send + Sync> Validate for Mock<F> {
-    fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        (self.0)(context, hypothesis)
-    }
-}
 
 /// Not `Params::default()`, which may change.
 fn base() -> Params {

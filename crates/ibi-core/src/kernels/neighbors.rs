@@ -37,7 +37,7 @@ impl Neighbors {
     /// for fewer than two points. Points that coincide are 0 apart.
     #[must_use]
     pub fn mean_spacing(&self, points: &[Point3<f64>]) -> f64 {
-        const TWO: NonZero<usize> = NonZero::new(2).unwrap();
+        const TWO: NonZero<usize> = NonZero::<usize>::MIN.saturating_add(1);
         let Some(tree) = &self.tree else { return 0.0 };
         let spacing = par::map(points.len(), 256, |i| {
             // The nearest is the point itself, or one at the same place.

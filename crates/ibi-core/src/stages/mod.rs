@@ -58,9 +58,10 @@ pub struct Context<'a> {
     pub params: &'a Params,
     /// Number of the round, from 0.
     pub round: u32,
-    /// Correspondences that may not lead a seed selection again: seeds of rejected poses. By id.
+    /// Whether a correspondence may not lead a seed selection (again), by id: with removal `inliers`, the seeds
+    /// of all rounds before.
     pub barred: &'a [bool],
-    /// Target rows that an accepted instance explains.
+    /// Whether an accepted instance explains a scene point, by row of the target.
     pub claimed: &'a [bool],
     /// The compatibility graph of all correspondences, built by the first stage that wants it.
     pub graph: &'a OnceLock<Graph>,
@@ -109,10 +110,10 @@ impl Context<'_> {
     /// almost anywhere.
     #[must_use]
     pub fn refined(&self, hypothesis: Hypothesis) -> Option<Hypothesis> {
-        if self.params.refine == Refine::None {
-            return Some(hypothesis);
-        }
-        let target_from_source = self.scene.refined(self.params, &hypothesis.target_from_source);
+        let target_from_source = match self.params.refine {
+            Refine::None => return Some(hypothesis),
+            Refine::Icp => self.scene.icp(self.params, &hypothesis.target_from_source),
+        };
         let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
         let is_supported = support >= self.params.t_s as usize;
         is_supported.then_some(Hypothesis { target_from_source, ..hypothesis })

@@ -48,7 +48,7 @@ impl LocalGtm {
     }
 
     fn build(&self, context: &Context<'_>) -> Graph {
-        let diameter_pr = context.scene.source.diameter / context.scene.resolution;
+        let diameter_pr = context.scene.source.diameter() / context.scene.resolution;
         let test = EdgeTest {
             tau: self.tau_pr as f32,
             min_length: self.min_length_pr as f32,

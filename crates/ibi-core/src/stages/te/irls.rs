@@ -59,11 +59,7 @@ impl EstimatePose for Irls {
 }
 
 /// The fit to the alive correspondences within `distance_pr` of `pose`.
-pub(super) fn refitted(
-    context: &Context<'_>,
-    pose: &Isometry3<f64>,
-    distance_pr: f64,
-) -> Option<Isometry3<f64>> {
+fn refitted(context: &Context<'_>, pose: &Isometry3<f64>, distance_pr: f64) -> Option<Isometry3<f64>> {
     let inliers = context.inliers(pose, distance_pr);
     rigid_fit(context.pairs.pairs(inliers.iter().copied()))
 }
