@@ -40,10 +40,12 @@ bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac pi
 	cargo bench -p ibi-core --bench '*' -- $(ARGS)
 
 .PHONY: tables
-tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables and write benchmarks/records (needs Open3D)
+tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables, write benchmarks/records and docs/figures (needs Open3D)
 	$(BIN)/python benchmarks/symmetry.py examples/models
-	$(BIN)/python benchmarks/ecc_layout.py
-	$(BIN)/python benchmarks/outlier_layout.py
+	$(BIN)/python benchmarks/near_copies.py examples/models
+	$(BIN)/python benchmarks/accuracy.py
+	$(BIN)/python benchmarks/ablation.py
+	$(BIN)/python benchmarks/calibration.py
 
 .PHONY: lint
 lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs

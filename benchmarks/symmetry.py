@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,17 +32,25 @@ def deviation(points: np.ndarray, starts: int = 300) -> tuple[float, float]:
     noise_sq = np.mean(tree.query(probe)[0] ** 2)
     centre = reference.mean(axis=0)
     best = (np.inf, 0.0)
-    for rotation in Rotation.random(starts, random_state=1):
-        turn = rotation.as_matrix()
-        shift = centre - turn @ centre
-        for _ in range(12):
-            _, rows = tree.query(probe @ turn.T + shift)
-            turn, shift = fit(probe, reference[rows])
+    for turn, shift in alignments(probe, tree, centre, starts):
         angle = np.degrees(Rotation.from_matrix(turn).magnitude())
         if angle > 20:
             other_sq = np.mean(tree.query(probe @ turn.T + shift)[0] ** 2)
             best = min(best, (float(np.sqrt(max(other_sq - noise_sq, 0.0))), float(angle)))
     return best
+
+
+def alignments(
+    probe: np.ndarray, tree: cKDTree, centre: np.ndarray, starts: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield motions of the probe onto the tree's points: random rotations about a centre, polished by ICP."""
+    for rotation in Rotation.random(starts, random_state=1):
+        turn = rotation.as_matrix()
+        shift = centre - turn @ centre
+        for _ in range(12):
+            _, rows = tree.query(probe @ turn.T + shift)
+            turn, shift = fit(probe, tree.data[rows])
+        yield turn, shift
 
 
 def fit(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

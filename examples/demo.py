@@ -1,11 +1,12 @@
 """Finds the parts in three real depth scans, prints their poses and draws them.
 
-    make demo                             # or: python examples/demo.py --scene multi
+    make demo                             # or: python examples/demo.py --scene tee6 --normals unsigned
 
 The scans and the models are shipped beside this file (Apache-2.0, see the README in each folder). The
 correspondences are real descriptor matches, 4 to 9 % of them right, made once by make_matches.py. Each scan
 is of one view: at most half of a part can be seen, so the preset `single_view` counts overlap over the model
-points that face the camera, and asks for 0.35 of them.
+points that face the camera, and asks for 0.35 of them. With normals whose sign means nothing, or without any,
+it cannot tell which points those are: the overlap is over the whole model then, and 0.2 of it is asked for.
 """
 
 from __future__ import annotations
@@ -18,7 +19,13 @@ import numpy as np
 from ibi_rs import metrics, plot
 
 HERE = Path(__file__).parent
-SCENES = {"multi": "provete2/multi.npz", "two": "provete2/two.npz", "tee6": "tee/tee6.npz"}
+SCENES = {"tee6": "tee/tee6.npz", "two": "provete2/two.npz", "multi": "provete2/multi.npz"}
+WHOLE = ibi.Overlap(t_overlap=0.2, exclusive=True)
+PARAMS = {
+    "oriented": ibi.Params.single_view(),
+    "unsigned": ibi.Params.single_view().replace(oriented_normals=False, hv=WHOLE),
+    "none": ibi.Params.single_view().replace(hv=WHOLE),
+}
 
 
 def main() -> None:
@@ -27,25 +34,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", choices=SCENES, help="default: all, one after the other")
+    parser.add_argument(
+        "--normals", choices=PARAMS, default="oriented", help="what is known of them; default: oriented"
+    )
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the pictures; default: out")
     arguments = parser.parse_args()
     for scene in [arguments.scene] if arguments.scene else SCENES:
-        show(scene, arguments.out)
+        show(scene, arguments.normals, arguments.out)
 
 
-def show(scene: str, out: Path) -> None:
+def show(scene: str, normals: str, out: Path) -> None:
     """Register one scene, print the poses beside the labels, draw."""
     data = np.load(HERE / SCENES[scene])
     src, tgt, corr = data["src"], data["tgt"], data["corr"]
-    found = ibi.register(
-        src,
-        tgt,
-        corr,
-        ibi.Params.single_view(),
-        src_normals=data["src_normals"],
-        tgt_normals=data["tgt_normals"],
-        viewpoint=data["viewpoint"],
-    )
+    given = {} if normals == "none" else {name: data[name] for name in ("src_normals", "tgt_normals")}
+    found = ibi.register(src, tgt, corr, PARAMS[normals], viewpoint=data["viewpoint"], **given)
 
     labelled = data["poses"].astype(np.float64)
     print(f"{scene}: {len(src)} model points, {len(tgt)} scene points, {len(corr)} correspondences,")

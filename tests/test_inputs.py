@@ -146,9 +146,7 @@ def test_point_correspondences_in_any_form(form):
 
 
 def test_numbers_of_numpy_are_numbers():
-    params = ibi.Params(
-        seed=np.uint64(0), t_he_pr=np.float32(3), t_s=np.int8(5), hv=ibi.Overlap(t_overlap=0.85)
-    )
+    params = ibi.Params(seed=np.uint64(0), t_he_pr=np.float32(1.5), t_s=np.int8(4), n_contest=np.uint16(60))
     options = {"num_threads": np.int32(1), "max_instances": np.int64(9), "timeout_s": np.float32(60)}
     assert content(register(params=params, **options)) == content(PLAIN)
 
@@ -322,7 +320,12 @@ VARIANTS = [
     for stage, union in (("scs", Scs), ("ce", Ce), ("te", Te))
     for variant in get_args(union) or (union,)
 ]
-CREDULOUS = {f"{stage} {word}": ibi.Params(**{stage: word}, hv="none") for stage, word in VARIANTS}
+BASES = {"default": ibi.Params(), "paper": ibi.Params.paper_synthetic()}
+CREDULOUS = {
+    f"{name} {stage} {word}": base.replace(**{stage: word}, hv="none")
+    for name, base in BASES.items()
+    for stage, word in VARIANTS
+}
 
 FRUITLESS = {
     "no correspondence": ({"corr": CORR[:0]}, "few_correspondences"),
@@ -351,6 +354,10 @@ def test_finding_nothing_is_an_answer(given, reason, params, capfd):
     assert np.asarray(found).shape == (0, 4, 4)
     assert (found.labels == -1).all()
     allowed = ("few_seeds", "few_correspondences") if reason is None else (reason,)
+    # `gtm` has no leader that a round could bar, and without a hypothesis nothing is removed.
+    if reason is None and params and params.removal == "inliers" and isinstance(params.scs, ibi.Gtm):
+        allowed += ("stalled",)
     assert found.stop_reason.name in allowed
-    assert found.stop_reason.value < found.stop_reason.threshold
+    if found.stop_reason.name != "stalled":
+        assert found.stop_reason.value < found.stop_reason.threshold
     assert capfd.readouterr() == ("", "")

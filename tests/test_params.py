@@ -28,16 +28,31 @@ OTHER = ibi.Params(
     ce=ibi.Off(),
     te=ibi.Ransac(n_ransac=5000, min_height_pr=0),
     hv=ibi.InlierCount(t_inliers=100),
-    removal=get_args(Removal)[-1],
+    removal=get_args(Removal)[0],
     max_rounds=9,
     max_instances=0,
     timeout_s=1e-3,
 )
+# None where the default is a number, and the other way round.
+UNLIMITED = ibi.Params(
+    min_normal_cos=None,
+    oriented_normals=True,
+    scs=ibi.LocalGtm(second_order=False, normal_tolerance=2),
+    hv=ibi.Evidence(t_score=0.01, exclusive=False),
+    refine="none",
+    n_contest=1,
+    joint_check=False,
+    max_rejections=None,
+    max_rounds=10,
+    timeout_s=5,
+)
 SETTINGS = {
     "default": PLAIN,
     "other": OTHER,
+    "unlimited": UNLIMITED,
     "paper_synthetic": ibi.Params.paper_synthetic(),
     "paper_real": ibi.Params.paper_real(),
+    "single_view": ibi.Params.single_view(),
 }
 each_setting = pytest.mark.parametrize("params", SETTINGS.values(), ids=SETTINGS)
 
@@ -45,7 +60,7 @@ each_setting = pytest.mark.parametrize("params", SETTINGS.values(), ids=SETTINGS
 # Defaults ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["default", "paper_synthetic", "paper_real"])
+@pytest.mark.parametrize("name", ["default", "paper_synthetic", "paper_real", "single_view"])
 def test_presets_are_those_of_the_core(name):
     assert SETTINGS[name].to_dict() == json.loads(_core.preset(name))
 
@@ -76,8 +91,23 @@ def test_the_core_knows_no_further_variant():
         assert all(f"`{variant.variant}`" in expected for variant in variants)
 
 
-def test_the_default_is_the_paper_for_synthetic_data_with_a_smaller_t_he():
-    assert ibi.Params.paper_synthetic().replace(t_he_pr=3) == PLAIN
+def test_the_default_is_not_the_paper():
+    """Each parameter in which it departs; docs/paper-map.md lists them."""
+    paper = ibi.Params.paper_synthetic()
+    departs = {f.name for f in fields(PLAIN) if getattr(PLAIN, f.name) != getattr(paper, f.name)}
+    lengths = {"delta_r_pr", "t_he_pr"}
+    assert departs == lengths | {
+        *("min_normal_cos", "t_s", "scs", "te", "hv", "refine"),
+        *("n_contest", "joint_check", "removal", "max_rejections"),
+    }
+    assert (PLAIN.scs, PLAIN.te, PLAIN.hv) == (ibi.LocalGtm(), ibi.Irls(), ibi.Evidence())
+    assert PLAIN.d_op_pr == paper.d_op_pr
+
+
+def test_the_paper_knows_no_additions():
+    for paper in (ibi.Params.paper_synthetic(), ibi.Params.paper_real()):
+        assert (paper.refine, paper.n_contest, paper.removal) == ("none", 1, "dense")
+        assert (paper.joint_check, paper.min_normal_cos, paper.max_rejections) == (False, None, None)
 
 
 # There and back ------------------------------------------------------------------------------------------
@@ -88,6 +118,19 @@ def test_dict_json_and_toml_lead_back(params):
     assert ibi.Params.from_dict(params.to_dict()) == params
     assert ibi.Params.from_dict(json.loads(json.dumps(params.to_dict()))) == params
     assert ibi.Params.from_toml(params.to_toml()) == params
+
+
+def test_toml_says_none_by_a_word():
+    """It has no null, and what it leaves out takes its default, which need not be None."""
+    text = UNLIMITED.to_toml()
+    for name in ("resolution", "min_normal_cos", "max_rejections", "max_instances"):
+        assert f'\n{name} = "none"\n' in f"\n{text}"
+        assert getattr(ibi.Params.from_toml(f'{name} = "none"'), name) is None
+    assert ibi.Params.from_toml('max_rejections = "none"') == PLAIN.replace(max_rejections=None)
+    assert ibi.Params.from_toml("max_rejections = 7\nmin_normal_cos = 0.5\ntimeout_s = 2") == PLAIN.replace(
+        max_rejections=7, min_normal_cos=0.5, timeout_s=2
+    )
+    assert json.loads(json.dumps(UNLIMITED.to_dict()))["max_rejections"] is None
 
 
 @each_setting
@@ -130,15 +173,15 @@ def test_words_stand_for_stages():
 def test_params_are_frozen_values():
     assert ibi.Params(t_s=6) == ibi.Params(t_s=6) != PLAIN
     assert ibi.Params(ce="off") != PLAIN
-    assert {PLAIN: "a", ibi.Params(t_s=5): "b"} == {PLAIN: "b"}
-    for frozen, name in ((PLAIN, "t_s"), (PLAIN.scs, "n_gtm")):
+    assert {PLAIN: "a", ibi.Params(t_s=4): "b"} == {PLAIN: "b"}
+    for frozen, name in ((PLAIN, "t_s"), (PLAIN.scs, "n_gtm"), (PLAIN.hv, "t_score")):
         with pytest.raises(FrozenInstanceError):
             setattr(frozen, name, 9)
 
 
 def test_replace_leaves_the_original():
     assert PLAIN.replace(t_s=6, hv="none") == ibi.Params(t_s=6, hv=ibi.None_())
-    assert PLAIN.t_s == 5
+    assert PLAIN.t_s == 4
     with pytest.raises(TypeError, match="t_z"):
         PLAIN.replace(t_z=6)
 
@@ -164,6 +207,7 @@ def test_a_subclass_stays_one():
 
 NAN, INF = float("nan"), float("inf")
 FLOAT, INT = "it must be a finite number", "it must be an integer from 0 to"
+BOOL = "it must be True or False"
 
 # Arguments, and what the message must begin with.
 REFUSED = [
@@ -184,10 +228,19 @@ REFUSED = [
     ({"t_he_pr": np.float32(NAN)}, f"params.t_he_pr is nan; {FLOAT}"),
     ({"d_op_pr": None}, f"params.d_op_pr is None; {FLOAT}"),
     ({"d_op_pr": 1j}, f"params.d_op_pr is 1j; {FLOAT}"),
+    ({"min_normal_cos": 1.5}, "params.min_normal_cos is 1.5; it must be between -1 and 1"),
+    ({"min_normal_cos": "none"}, f"params.min_normal_cos is 'none'; {FLOAT}"),
+    ({"oriented_normals": 1}, f"params.oriented_normals is 1; {BOOL}"),
+    ({"oriented_normals": None}, f"params.oriented_normals is None; {BOOL}"),
     ({"t_s": 2}, "params.t_s is 2; it must be at least 3"),
     ({"t_s": 5.5}, f"params.t_s is 5.5; {INT}"),
     ({"t_s": True}, f"params.t_s is True; {INT}"),
+    ({"refine": "off"}, "params.refine is 'off'; it must be one of 'none', 'icp'"),
+    ({"n_contest": 0}, "params.n_contest is 0; it must be at least 1"),
+    ({"joint_check": "yes"}, f"params.joint_check is 'yes'; {BOOL}"),
     ({"removal": "all"}, "params.removal is 'all'; it must be one of 'dense'"),
+    ({"max_rejections": -1}, f"params.max_rejections is -1; {INT}"),
+    ({"max_rejections": "none"}, f"params.max_rejections is 'none'; {INT}"),
     ({"max_rounds": -1}, f"params.max_rounds is -1; {INT}"),
     ({"max_instances": 2**32}, f"params.max_instances is 4294967296; {INT}"),
     ({"timeout_s": -1}, "params.timeout_s is -1; it must be between 0 and 1e9 seconds"),
@@ -197,7 +250,7 @@ REFUSED = [
     ({"ce": "none"}, "params.ce is 'none'; it must be one of 'voting', 'off'"),
     ({"ce": ibi.Gtm()}, "params.ce is Gtm("),
     ({"te": ibi.Gsac}, "params.te is <class 'ibi_rs.params.Gsac'>; it must be one of Gsac(), "),
-    ({"hv": "off"}, "params.hv is 'off'; it must be one of 'overlap', 'inlier_count', 'none'"),
+    ({"hv": "off"}, "params.hv is 'off'; it must be one of 'evidence', 'overlap', 'inlier_count', 'none'"),
     ({"scs": ibi.Gtm(n_downsample=2)}, "params.scs.n_downsample is 2; it must be at least 3"),
     ({"scs": ibi.Gtm(n_downsample=16385)}, "params.scs.n_downsample is 16385; it must be at most 16384"),
     ({"scs": ibi.Gtm(n_gtm=0)}, "params.scs.n_gtm is 0; it must be at least 1"),
@@ -205,6 +258,10 @@ REFUSED = [
         {"scs": ibi.Gtm(payoff="linear")},
         "params.scs.payoff is 'linear'; it must be one of 'gaussian', 'ratio'",
     ),
+    ({"scs": ibi.LocalGtm(tau_pr=0)}, "params.scs.tau_pr is 0; it must be between 1e-9 and 1e9"),
+    ({"scs": ibi.LocalGtm(min_length_pr=-1)}, "params.scs.min_length_pr is -1; it must be 0 or between"),
+    ({"scs": ibi.LocalGtm(normal_tolerance=0)}, "params.scs.normal_tolerance is 0; it must be between"),
+    ({"scs": ibi.LocalGtm(second_order=0)}, f"params.scs.second_order is 0; {BOOL}"),
     ({"ce": ibi.Voting(n_vot=2)}, "params.ce.n_vot is 2; it must be at least 3"),
     ({"ce": ibi.Voting(n_vot=300.5)}, f"params.ce.n_vot is 300.5; {INT}"),
     ({"te": ibi.Gsac(n_gsac=0)}, "params.te.n_gsac is 0; it must be at least 1"),
@@ -212,6 +269,12 @@ REFUSED = [
     ({"te": ibi.Ransac(n_ransac=0)}, "params.te.n_ransac is 0; it must be at least 1"),
     ({"te": ibi.Ransac(n_ransac=10**7 + 1)}, "params.te.n_ransac is 10000001; it must be at most 10,000,000"),
     ({"te": ibi.Ransac(n_ransac=None)}, f"params.te.n_ransac is None; {INT}"),
+    ({"te": ibi.Irls(n_refits=0)}, "params.te.n_refits is 0; it must be at least 1"),
+    ({"te": ibi.Irls(n_refits=1001)}, "params.te.n_refits is 1001; it must be at most 1000"),
+    ({"hv": ibi.Evidence(t_score=1.1)}, "params.hv.t_score is 1.1; it must be between 0 and 1"),
+    ({"hv": ibi.Evidence(t_score=-0.1)}, "params.hv.t_score is -0.1; it must be between 0 and 1"),
+    ({"hv": ibi.Evidence(t_score=NAN)}, f"params.hv.t_score is nan; {FLOAT}"),
+    ({"hv": ibi.Evidence(exclusive=None)}, f"params.hv.exclusive is None; {BOOL}"),
     ({"hv": ibi.Overlap(t_overlap=1.1)}, "params.hv.t_overlap is 1.1; it must be between 0 and 1"),
     ({"hv": ibi.Overlap(t_overlap=NAN)}, f"params.hv.t_overlap is nan; {FLOAT}"),
     ({"hv": ibi.InlierCount(t_inliers=0)}, "params.hv.t_inliers is 0; it must be at least 1"),
@@ -262,6 +325,10 @@ TOML = [
     ("t_s = 2", "params.t_s is 2; it must be at least 3"),
     ("t_he_pr = nan", "params.t_he_pr is NaN; it must be between"),
     ("\nseed = -1", "line 2"),
+    ('\nmax_rejections = "nope"', "line 2"),
+    ("max_rejections = 1.5", 'a number or "none"'),
+    ('min_normal_cos = "1"', 'a number or "none"'),
+    ('t_s = "none"', "line 1"),
     ("seed == 1", "line 1"),
     ('[ce]\nvariant = "of"', "`of`"),
     ('[scs]\nvariant = "gtm"\nn_gmt = 1', "`n_gmt`"),

@@ -11,8 +11,10 @@ import pytest
 from ibi_rs import metrics
 from ibi_rs.params import Ce, Hv, Removal, Scs, Te
 
-# Fewer correspondences a round than the default: several rounds, accepted and rejected ones.
-SMALL_ROUNDS = ibi.Params(ce=ibi.Voting(n_vot=100))
+PLAIN = ibi.Params()
+# The loop of the paper: each accepted hypothesis becomes an instance at once. Fewer correspondences a round
+# than there make several rounds, accepted and rejected ones.
+PAPER = ibi.Params.paper_synthetic().replace(t_he_pr=3, ce=ibi.Voting(n_vot=100))
 
 
 def scene_of(seed):
@@ -24,18 +26,22 @@ def scene_of(seed):
 SCENE = scene_of(0)
 
 
-def register(params=SMALL_ROUNDS, *, corr=SCENE.corr, **options):
+def register(params=PAPER, *, corr=SCENE.corr, **options):
     return ibi.register(SCENE.src, SCENE.tgt, corr, params, **options)
 
 
-FOUND = register()
+RUNS = {"default": register(PLAIN), "paper": register(PAPER)}
+each_run = pytest.mark.parametrize("found", RUNS.values(), ids=RUNS)
+FOUND = RUNS["paper"]
 NOTHING = register(corr=SCENE.corr[:2])
+
+MEASURES = ("score", "overlap", "closeness", "back_fit", "evidence", "inlier_rmse")
 
 
 def content(found):
     """Everything but the seconds, in a form that == compares to the bit."""
     poses = [
-        (p.target_from_source.tobytes(), p.score, p.overlap, p.inlier_rmse, p.inliers.tobytes(), p.round)
+        (p.target_from_source.tobytes(), [getattr(p, m) for m in MEASURES], p.inliers.tobytes(), p.round)
         for p in found
     ]
     return poses, found.labels.tobytes(), found.rounds, found.stop_reason, found.resolution, found.params
@@ -44,51 +50,61 @@ def content(found):
 # Types ---------------------------------------------------------------------------------------------------
 
 
-def test_a_registration_is_typed_throughout():
-    assert isinstance(FOUND, ibi.Registration)
-    assert isinstance(FOUND.poses, tuple)
-    assert isinstance(FOUND.rounds, tuple)
-    assert isinstance(FOUND.stop_reason, ibi.StopReason)
-    assert isinstance(FOUND.timings, ibi.Timings)
-    assert type(FOUND.resolution) is float
-    assert FOUND.params == SMALL_ROUNDS
-    assert FOUND.labels.dtype == np.int32
-    assert FOUND.labels.shape == (len(SCENE.corr),)
+@each_run
+def test_a_registration_is_typed_throughout(found):
+    assert isinstance(found, ibi.Registration)
+    assert isinstance(found.poses, tuple)
+    assert isinstance(found.rounds, tuple)
+    assert isinstance(found.stop_reason, ibi.StopReason)
+    assert isinstance(found.timings, ibi.Timings)
+    assert type(found.resolution) is float
+    assert found.params in (PLAIN, PAPER)
+    assert found.labels.dtype == np.int32
+    assert found.labels.shape == (len(SCENE.corr),)
 
 
-def test_a_pose_is_typed_throughout():
-    assert len(FOUND) >= 4
-    for pose in FOUND:
+@each_run
+def test_a_pose_is_typed_throughout(found):
+    assert len(found) >= 4
+    for pose in found:
         assert isinstance(pose, ibi.Pose)
         assert pose.target_from_source.shape == (4, 4)
         assert pose.target_from_source.dtype == np.float64
         assert pose.transformation is pose.target_from_source
-        assert {type(pose.score), type(pose.overlap), type(pose.inlier_rmse)} == {float}
+        assert {type(getattr(pose, measure)) for measure in MEASURES} == {float}
         assert type(pose.round) is int
         assert pose.inliers.dtype == np.int64
         assert pose.inliers.shape == (pose.num_inliers,)
         assert (np.diff(pose.inliers) > 0).all()
-        assert FOUND.rounds[pose.round].accepted
+        assert found.rounds[pose.round].accepted
+    assert {field.name for field in fields(ibi.Pose)} == {
+        *MEASURES,
+        *("target_from_source", "inliers", "round"),
+    }
 
 
-def test_a_round_is_typed_throughout():
-    assert [entry.index for entry in FOUND.rounds] == list(range(len(FOUND.rounds)))
-    assert sum(entry.accepted for entry in FOUND.rounds) == len(FOUND)
+@each_run
+def test_a_round_is_typed_throughout(found):
+    assert [entry.index for entry in found.rounds] == list(range(len(found.rounds)))
+    accepted = sum(entry.accepted for entry in found.rounds)
+    # In a contest several rounds may come to one instance.
+    assert accepted == len(found) if found.params.n_contest == 1 else accepted >= len(found)
     counts = {f.name for f in fields(ibi.Round)} - {"hypothesis_score", "verdict"}
-    for entry in FOUND.rounds:
+    for entry in found.rounds:
         assert isinstance(entry, ibi.Round)
         assert {type(getattr(entry, name)) for name in counts} == {int}
         assert type(entry.hypothesis_score) is float
         assert isinstance(entry.verdict, ibi.Verdict)
         assert entry.accepted == entry.verdict.accepted == (entry.verdict.value > entry.verdict.threshold)
         assert 0 <= entry.num_degenerate <= entry.num_samples
-    alive = [entry.num_alive for entry in FOUND.rounds]
-    removed = [entry.num_removed for entry in FOUND.rounds]
+    alive = [entry.num_alive for entry in found.rounds]
+    removed = [entry.num_removed for entry in found.rounds]
     assert alive == [len(SCENE.corr) - sum(removed[:i]) for i in range(len(removed))]
 
 
-def test_the_seconds_add_up():
-    seconds = asdict(FOUND.timings)
+@each_run
+def test_the_seconds_add_up(found):
+    seconds = asdict(found.timings)
     assert all(type(s) is float and s >= 0 for s in seconds.values())
     assert sum(seconds.values()) - seconds["total_s"] <= seconds["total_s"]
     assert NOTHING.timings.scs_s == 0
@@ -161,39 +177,42 @@ def test_results_cannot_be_changed_by_accident():
 # What the numbers mean -----------------------------------------------------------------------------------
 
 
-def test_poses_are_proper_rotations_with_a_last_row():
-    matrices = np.asarray(FOUND)
+@each_run
+def test_poses_are_proper_rotations_with_a_last_row(found):
+    matrices = np.asarray(found)
     rotations = matrices[:, :3, :3]
     gram = rotations @ rotations.transpose(0, 2, 1)
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-12)
-    np.testing.assert_array_equal(matrices[:, 3], np.broadcast_to([0, 0, 0, 1], (len(FOUND), 4)))
+    np.testing.assert_array_equal(matrices[:, 3], np.broadcast_to([0, 0, 0, 1], (len(found), 4)))
 
 
-def test_poses_are_sorted_by_their_score():
-    scores = [pose.score for pose in FOUND]
+@each_run
+def test_poses_are_sorted_by_their_score(found):
+    scores = [pose.score for pose in found]
     assert scores == sorted(scores, reverse=True)
-    assert all(0 <= pose.overlap <= 1 for pose in FOUND)
-    assert all(pose.score == pose.overlap for pose in FOUND)
+    for pose in found:
+        assert 0 <= pose.score <= 1
+        assert 0 <= pose.overlap <= 1
+        assert 0 <= pose.back_fit <= 1
+        assert pose.closeness <= 1
+        assert pose.evidence >= 0
 
 
-def test_inliers_rmse_overlap_and_labels_follow_from_the_poses():
+@each_run
+def test_inliers_rmse_overlap_and_labels_follow_from_the_poses(found):
     """Recomputed with numpy from the definitions in the docstrings."""
-    residuals = np.stack(
-        [
-            np.linalg.norm(moved(pose)[SCENE.corr[:, 0]] - SCENE.tgt[SCENE.corr[:, 1]], axis=1)
-            for pose in FOUND
-        ]
-    )
-    t_he = FOUND.params.t_he_pr * FOUND.resolution
-    for pose, residual in zip(FOUND, residuals, strict=True):
+    residuals = np.stack([residuals_of(pose) for pose in found])
+    t_he = found.params.t_he_pr * found.resolution
+    for pose, residual in zip(found, residuals, strict=True):
         np.testing.assert_array_equal(pose.inliers, np.flatnonzero(residual < t_he))
         rmse = np.sqrt(np.mean(residual[pose.inliers] ** 2))
         assert pose.inlier_rmse == pytest.approx(rmse, rel=1e-9)
-        assert pose.overlap == pytest.approx(overlap(pose), abs=1e-12)
+        d_op = found.params.d_op_pr * found.resolution
+        assert pose.overlap == pytest.approx(np.mean(distances(moved(pose), SCENE.tgt)[0] < d_op), abs=1e-12)
     labels = np.where(residuals.min(axis=0) < t_he, residuals.argmin(axis=0), -1)
-    np.testing.assert_array_equal(FOUND.labels, labels)
-    assert set(FOUND.labels.tolist()) <= set(range(-1, len(FOUND)))
+    np.testing.assert_array_equal(found.labels, labels)
+    assert set(found.labels.tolist()) <= set(range(-1, len(found)))
 
 
 def moved(pose):
@@ -201,10 +220,85 @@ def moved(pose):
     return SCENE.src @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def overlap(pose):
-    points, d_op = moved(pose), FOUND.params.d_op_pr * FOUND.resolution
-    dist_sq = (points**2).sum(1)[:, None] + (SCENE.tgt**2).sum(1) - 2 * points @ SCENE.tgt.T
-    return np.mean(dist_sq.min(axis=1) < d_op**2)
+def residuals_of(pose):
+    return np.linalg.norm(moved(pose)[SCENE.corr[:, 0]] - SCENE.tgt[SCENE.corr[:, 1]], axis=1)
+
+
+def distances(a, b):
+    """From each point of a to the nearest of b, and which that is."""
+    dist_sq = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
+    return np.sqrt(np.maximum(dist_sq.min(axis=1), 0)), dist_sq.argmin(axis=1)
+
+
+# Without a joint check every correspondence and every target point is free for every pose.
+NOT_SHARED = register(PLAIN.replace(joint_check=False, hv=ibi.Evidence(t_score=0.001)))
+
+
+def test_evidence_and_back_fit_follow_from_the_poses():
+    """Recomputed with numpy: the binomial tail by its bound, the chance by counting neighbours."""
+    pr, params = NOT_SHARED.resolution, NOT_SHARED.params
+    d_op, t_he = params.d_op_pr * pr, params.t_he_pr * pr
+    drawn, targets = SCENE.corr[:, 0], SCENE.tgt[SCENE.corr[:, 1]]
+    assert len(NOT_SHARED) >= 4
+    for pose in NOT_SHARED:
+        distance, nearest = distances(targets, moved(pose))
+        near = distance < 2 * d_op
+        assert pose.back_fit == pytest.approx(np.mean(1 - distance[near] / (2 * d_op)), rel=1e-6)
+
+        explained = distance < d_op
+        gaps = np.linalg.norm(SCENE.src[nearest[explained]][:, None] - SCENE.src[drawn], axis=2)
+        n, p = explained.sum(), np.mean(gaps < t_he)
+        share = np.mean(residuals_of(pose)[explained] < t_he)
+        parts = [a * np.log(a / b) if a > 0 else 0.0 for a, b in ((share, p), (1 - share, 1 - p))]
+        assert pose.evidence == pytest.approx(n * sum(parts) / np.log(10), rel=1e-5)
+
+
+def test_the_score_is_a_probability_of_its_three_measures():
+    """Its log odds are linear in them, the same for all scenes; no weight is negative."""
+    poses = list(NOT_SHARED)
+    for seed in range(1, 5):
+        scene = ibi.synth.outlier_layout(seed, num_instances=4, outlier_ratio=0.8, exact=False)
+        poses += ibi.register(scene.src, scene.tgt, scene.corr)
+    odds = [np.log(pose.score / (1 - pose.score)) for pose in poses]
+    features = np.array([[1, np.log1p(p.evidence), p.closeness, p.back_fit] for p in poses])
+    weights, _, rank, _ = np.linalg.lstsq(features, odds)
+    assert rank == 4
+    np.testing.assert_allclose(features @ weights, odds, atol=1e-6)
+    assert (weights[1:] > 0).all()
+
+
+def test_a_better_fit_is_closer():
+    """Closeness is 1 where every source point has its own target point, and falls with the noise."""
+    rng = np.random.default_rng(0)
+    src, clutter = rng.normal(size=(200, 3)), rng.uniform(-20, 20, (500, 3))
+    corr = np.stack([np.arange(200)] * 2, axis=1)
+    closeness, shift = [], np.array([5, 0, 0])
+    for noise in (0, 0.05, 0.1):
+        tgt = np.vstack([src + shift + rng.normal(0, noise, src.shape), clutter])
+        closeness.append(ibi.register(src, tgt, corr)[0].closeness)
+    assert closeness[0] == pytest.approx(1, abs=1e-6)
+    assert closeness == sorted(closeness, reverse=True)
+    assert closeness[2] < 0.95
+
+
+@pytest.mark.parametrize("outlier_ratio", [0.6, 0.9])
+def test_the_unit_does_not_matter(outlier_ratio):
+    """Millimetres for metres: the poses scale, and everything else stays."""
+    scene = ibi.synth.outlier_layout(5, num_instances=4, outlier_ratio=outlier_ratio, exact=False)
+    found = ibi.register(scene.src, scene.tgt, scene.corr)
+    scaled = ibi.register(1000 * scene.src, 1000 * scene.tgt, scene.corr)
+    assert len(found) == 4
+    back = np.array(scaled)
+    back[:, :3, 3] /= 1000
+    np.testing.assert_allclose(back, np.asarray(found), atol=1e-9)
+    np.testing.assert_array_equal(scaled.labels, found.labels)
+    assert scaled.resolution == pytest.approx(1000 * found.resolution)
+    assert scaled.stop_reason == found.stop_reason
+    assert len(scaled.rounds) == len(found.rounds)
+    for a, b in zip(scaled, found, strict=True):
+        assert a.inlier_rmse == pytest.approx(1000 * b.inlier_rmse)
+        for measure in set(MEASURES) - {"inlier_rmse"}:
+            assert getattr(a, measure) == pytest.approx(getattr(b, measure), rel=1e-6)
 
 
 def test_the_resolution_is_the_mean_spacing_unless_given():
@@ -227,6 +321,31 @@ def test_the_truth_is_found(seed):
     truth = scene.labels()
     for label, match in enumerate(score.matches):
         assert np.mean(truth[found.labels == label] == match.truth) > 0.9
+    assert min(pose.score for pose in found) > 0.9
+
+
+@pytest.mark.parametrize("outlier_ratio", [0.6, 0.9, 0.97])
+@pytest.mark.parametrize("exact", [True, False])
+def test_nothing_is_missed_and_nothing_invented(outlier_ratio, exact):
+    scene = ibi.synth.outlier_layout(7, num_instances=5, outlier_ratio=outlier_ratio, exact=exact)
+    score = metrics.score_scene(ibi.register(scene.src, scene.tgt, scene.corr), scene.poses)
+    assert (score.recall, score.precision) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("num_correspondences", [200, 3000])
+def test_no_instance_gives_no_pose(seed, num_correspondences):
+    scene = ibi.synth.outlier_layout(seed, num_instances=0, num_correspondences=num_correspondences)
+    found = ibi.register(scene.src, scene.tgt, scene.corr)
+    assert len(found) == 0, found
+    assert found.stop_reason.name in ("few_seeds", "max_rejections")
+
+
+def test_a_threshold_is_exceeded():
+    """Nothing has a probability of more than 1; everything one of more than 0."""
+    none, some, all_ = (register(PLAIN.replace(hv=ibi.Evidence(t_score=t))) for t in (1, 0.5, 0))
+    assert len(none) == 0 < len(some) <= len(all_)
+    assert all(pose.score > 0.5 for pose in some)
 
 
 @pytest.mark.parametrize("jitter", [0, 1e-6, 1e-3])
@@ -251,21 +370,117 @@ def test_point_correspondences_give_what_row_correspondences_give():
 
 def test_optional_arrays_are_taken():
     normals = [np.random.default_rng(0).normal(size=cloud.shape) for cloud in (SCENE.src, SCENE.tgt)]
-    found = register(
-        src_normals=normals[0],
-        tgt_normals=normals[1].tolist(),
-        similarity=np.linspace(0, 1, len(SCENE.corr), dtype=np.float32),
-        viewpoint=(0, 0, 1),
+    given = {
+        "src_normals": normals[0],
+        "tgt_normals": normals[1].tolist(),
+        "similarity": np.linspace(0, 1, len(SCENE.corr), dtype=np.float32),
+        "viewpoint": (0, 0, 1),
+    }
+    assert content(register(**given)) == content(FOUND)  # the paper knows none of them
+    # The default looks at normals, and these are wrong.
+    overlaps = [pose.overlap for pose in register(PLAIN, **given)]
+    assert max(overlaps) < 0.9 < min(pose.overlap for pose in RUNS["default"])
+
+
+# The joint check -----------------------------------------------------------------------------------------
+
+SHAPES = {name: ibi.synth.shape(name, 1000, np.random.default_rng(9)) for name in ("clamp", "mug", "valve")}
+
+
+def described(points, normals):
+    """Where a point lies on its shape, and how it faces: cheap descriptors."""
+    return np.hstack([points, 0.1 * normals])
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_the_joint_check_drops_poses_that_live_on_what_others_own(seed):
+    """Almost everything is accepted, at once: wrong early poses, which the right ones then take apart."""
+    scene = ibi.synth.ecc_layout(seed, shapes=SHAPES, descriptors=described, descriptor_noise=0.3)
+    params = PLAIN.replace(hv=ibi.Evidence(t_score=1e-4), n_contest=1)
+    kept, everything = (
+        ibi.register(scene.src, scene.tgt, scene.corr, params.replace(joint_check=check))
+        for check in (True, False)
     )
-    assert content(found) == content(FOUND)  # no variant uses them yet
+    matrices = [{pose.target_from_source.tobytes() for pose in found} for found in (kept, everything)]
+    assert matrices[0] < matrices[1]
+    assert kept.rounds == everything.rounds  # it comes after the last round
+    # What it drops is wrong.
+    hits = [metrics.score_scene(found, scene.poses).num_predicted_hit for found in (kept, everything)]
+    assert hits[0] == hits[1]
+
+
+def test_the_joint_check_leaves_what_does_not_touch():
+    unchecked = register(PLAIN.replace(joint_check=False))
+    for pose, twin in zip(RUNS["default"], unchecked, strict=True):
+        assert pose.target_from_source.tobytes() == twin.target_from_source.tobytes()
+
+
+# Normals -------------------------------------------------------------------------------------------------
+
+
+def scene_with_normals():
+    """Three clamps among outliers: clouds, correspondences, poses, and outward normals of both clouds."""
+    rng = np.random.default_rng(0)
+    src, src_normals = ibi.synth.shape("clamp", 400, rng)
+    poses = SCENE.poses[:3]
+    tgt = np.vstack([src @ pose[:3, :3].T + pose[:3, 3] for pose in poses])
+    tgt = tgt + rng.normal(0, 0.005, tgt.shape)
+    tgt_normals = np.vstack([src_normals @ pose[:3, :3].T for pose in poses])
+    rows = rng.choice(1200, 150, replace=False)
+    true = np.stack([rows % 400, rows], axis=1)
+    wrong = np.stack([rng.integers(400, size=1350), rng.integers(1200, size=1350)], axis=1)
+    return src, tgt, rng.permutation(np.vstack([true, wrong])), poses, src_normals, tgt_normals
+
+
+SRC, TGT, CORR, POSES, SRC_NORMALS, TGT_NORMALS = scene_with_normals()
+
+
+def with_normals(src_normals, tgt_normals, **changes):
+    params = PLAIN.replace(**changes)
+    return ibi.register(SRC, TGT, CORR, params, src_normals=src_normals, tgt_normals=tgt_normals)
+
+
+@pytest.mark.parametrize("oriented", [True, False])
+def test_all_is_found_with_normals(oriented):
+    found = with_normals(SRC_NORMALS, 3 * TGT_NORMALS, oriented_normals=oriented)
+    assert metrics.score_scene(found, POSES).f1 == 1
+    assert len(found) == 3
+
+
+def test_the_sign_of_normals_without_orientation_does_not_matter():
+    plain = with_normals(SRC_NORMALS, TGT_NORMALS)
+    assert len(plain) == 3
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        src_signs, tgt_signs = (rng.choice([-1, 1], (len(cloud), 1)) for cloud in (SRC, TGT))
+        found = with_normals(src_signs * SRC_NORMALS, tgt_signs * TGT_NORMALS)
+        np.testing.assert_allclose(np.asarray(found), np.asarray(plain), atol=1e-12)
+        np.testing.assert_array_equal(found.labels, plain.labels)
+        for a, b in zip(found, plain, strict=True):
+            assert [getattr(a, m) for m in MEASURES] == pytest.approx([getattr(b, m) for m in MEASURES])
+
+
+def test_the_sign_of_oriented_normals_does_matter():
+    assert len(with_normals(SRC_NORMALS, -TGT_NORMALS, oriented_normals=True)) == 0
+    assert len(with_normals(-SRC_NORMALS, -TGT_NORMALS, oriented_normals=True)) == 3
+
+
+def test_normals_can_be_left_out():
+    wrong = np.random.default_rng(0).normal(size=TGT.shape)
+    ignored = {"min_normal_cos": None, "scs": ibi.LocalGtm(normal_tolerance=2)}
+    bare = ibi.register(SRC, TGT, CORR)
+    assert len(bare) == 3
+    np.testing.assert_array_equal(np.asarray(with_normals(SRC_NORMALS, wrong, **ignored)), np.asarray(bare))
+    assert all(pose.overlap < 0.9 for pose in with_normals(SRC_NORMALS, wrong))
 
 
 # The same bits -------------------------------------------------------------------------------------------
 
 
+@each_run
 @pytest.mark.parametrize("num_threads", [1, 2, 7, np.int64(3)])
-def test_the_number_of_threads_changes_no_bit(num_threads):
-    assert content(register(num_threads=num_threads)) == content(FOUND)
+def test_the_number_of_threads_changes_no_bit(found, num_threads):
+    assert content(register(found.params, num_threads=num_threads)) == content(found)
 
 
 EACH_VARIANT = [
@@ -275,9 +490,10 @@ EACH_VARIANT = [
 ] + [{"removal": word} for word in get_args(Removal)]
 
 
+@pytest.mark.parametrize("base", [PLAIN, PAPER], ids=["default", "paper"])
 @pytest.mark.parametrize("change", EACH_VARIANT, ids=lambda change: "-".join(*change.items()))
-def test_no_variant_depends_on_the_number_of_threads(change):
-    params = SMALL_ROUNDS.replace(**change, max_rounds=8)
+def test_no_variant_depends_on_the_number_of_threads(change, base):
+    params = base.replace(**change, max_rounds=8)
     one = register(params, num_threads=1)
     assert one.rounds
     assert content(register(params, num_threads=5)) == content(one)
@@ -286,12 +502,13 @@ def test_no_variant_depends_on_the_number_of_threads(change):
 @pytest.mark.parametrize("text", ["1", "3", ""])
 def test_the_environment_changes_no_bit(monkeypatch, text):
     monkeypatch.setenv("IBI_NUM_THREADS", text)
-    assert content(register()) == content(FOUND)
+    for found in RUNS.values():
+        assert content(register(found.params)) == content(found)
 
 
 def test_the_seed_changes_the_samples():
     """With fewer players than correspondences another seed draws others."""
-    params = [ibi.Params(seed=seed, scs=ibi.Gtm(n_downsample=300)) for seed in (1, 1, 2)]
+    params = [PAPER.replace(seed=seed, scs=ibi.Gtm(n_downsample=300)) for seed in (1, 1, 2)]
     a, b, c = (content(register(p))[2] for p in params)
     assert a == b
     assert a != c
@@ -300,14 +517,22 @@ def test_the_seed_changes_the_samples():
 # Why it stops --------------------------------------------------------------------------------------------
 
 
+# The same rows in other company: nothing is consistent by more than chance.
+SHUFFLED = np.stack([np.random.default_rng(0).permutation(SCENE.corr[:, 0]), SCENE.corr[:, 1]], axis=1)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "threshold", "options"),
     [
         ("few_correspondences", 0, 3, {"corr": np.empty((0, 2), int)}),
         ("few_seeds", 0, 5, {"corr": np.repeat(SCENE.corr[:1], 50, axis=0)}),
-        ("max_rounds", 2, 2, {"params": SMALL_ROUNDS.replace(max_rounds=2)}),
-        ("max_rounds", 0, 0, {"params": SMALL_ROUNDS.replace(max_rounds=0)}),
-        ("max_instances", 1, 1, {"params": SMALL_ROUNDS.replace(max_instances=1)}),
+        ("few_seeds", 0, 4, {"params": PLAIN, "corr": np.repeat(SCENE.corr[:1], 50, axis=0)}),
+        ("max_rejections", 3, 3, {"params": PLAIN.replace(max_rejections=3), "corr": SHUFFLED}),
+        ("max_rounds", 2, 2, {"params": PAPER.replace(max_rounds=2)}),
+        ("max_rounds", 2, 2, {"params": PLAIN.replace(max_rounds=2)}),
+        ("max_rounds", 0, 0, {"params": PAPER.replace(max_rounds=0)}),
+        ("max_instances", 1, 1, {"params": PAPER.replace(max_instances=1)}),
+        ("max_instances", 2, 2, {"params": PLAIN.replace(max_instances=2)}),
         ("max_instances", 2, 2, {"max_instances": 2}),
         ("timeout", None, 0.0, {"timeout_s": 0}),
         ("cancelled", None, None, {"callback": lambda _: False}),
@@ -331,7 +556,7 @@ def test_every_stop_reason_carries_its_measure(name, value, threshold, options):
 
 
 def test_arguments_override_params():
-    params = SMALL_ROUNDS.replace(max_instances=3, timeout_s=100)
+    params = PAPER.replace(max_instances=3, timeout_s=100)
     assert register(params, max_instances=1).params == params.replace(max_instances=1)
     assert register(params, timeout_s=50).params == params.replace(timeout_s=50)
     assert len(register(params, max_instances=1)) == 1
@@ -348,6 +573,16 @@ def test_a_stopped_run_keeps_what_the_full_run_found_first():
         ]
 
 
+def test_a_stopped_contest_keeps_the_best_of_what_it_has():
+    """Also where the run ends before its first contest does."""
+    for limit in (2, 5, 20):
+        found = register(PLAIN.replace(max_rounds=limit))
+        assert len(found.rounds) == limit
+        assert 1 <= len(found) <= limit
+        assert all(pose.round < limit for pose in found)
+        assert metrics.score_scene(found, SCENE.poses).precision == 1
+
+
 # The callback --------------------------------------------------------------------------------------------
 
 
@@ -360,9 +595,11 @@ def test_the_callback_sees_every_round_in_order(answer):
         seen.append(entry)
         return answer
 
-    found = register(callback=callback)
-    assert tuple(seen) == found.rounds
-    assert content(found) == content(FOUND)
+    for run in RUNS.values():
+        seen.clear()
+        found = register(run.params, callback=callback)
+        assert tuple(seen) == found.rounds
+        assert content(found) == content(run)
 
 
 @pytest.mark.parametrize("no", [False, np.False_])

@@ -1,5 +1,6 @@
 """Scenes from a seed: what the generators promise about sizes, truth and determinism."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -14,11 +15,11 @@ MODELS = Path(__file__).parents[1] / "examples" / "models"
 
 
 def assert_same_bytes(a, b):
-    for name in ("src", "tgt", "corr", "poses"):
-        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
-    assert a.name == b.name
-    assert (a.similarity is None) == (b.similarity is None)
-    assert a.similarity is None or a.similarity.tobytes() == b.similarity.tobytes()
+    for field in dataclasses.fields(a):
+        left, right = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(left, np.ndarray):
+            left, right = left.tobytes(), right.tobytes()
+        assert left == right, field.name
 
 
 def assert_well_formed(scene):
@@ -36,6 +37,9 @@ def assert_well_formed(scene):
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
     np.testing.assert_array_equal(scene.poses[:, 3], np.broadcast_to([0, 0, 0, 1], (scene.num_instances, 4)))
+
+
+def assert_in_the_octant(scene):
     distance = np.linalg.norm(scene.poses[:, :3, 3], axis=1)
     assert (scene.poses[:, :3, 3] >= 0).all()
     assert ((distance >= 2.5) & (distance <= 12.5)).all()
@@ -59,6 +63,7 @@ def test_outlier_layout_keeps_its_promises(band, exact):
     for seed in range(2 if exact else 1):
         scene = synth.outlier_layout(seed, outlier_ratio=band, exact=exact)
         assert_well_formed(scene)
+        assert_in_the_octant(scene)
         assert 5 <= scene.num_instances <= 20
         assert 1000 <= len(scene.corr) <= 5000
         assert len(scene.tgt) == 1024 * scene.num_instances + 1000
@@ -114,10 +119,52 @@ def test_outlier_layout_takes_single_numbers_and_clouds():
     assert np.linalg.norm(scene.src, axis=1).max() == pytest.approx(1)
 
 
+def least_gap(centers):
+    return np.min(np.linalg.norm(centers[:, None] - centers, axis=2) + 1e9 * np.eye(len(centers)))
+
+
 def test_instances_keep_their_distance():
-    centers = synth.outlier_layout(3, num_instances=20).poses[:, :3, 3]
-    gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2) + 1e9 * np.eye(20)
-    assert gaps.min() >= 1.0
+    assert least_gap(synth.outlier_layout(3, num_instances=20).poses[:, :3, 3]) >= 1.0
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_true_pairs_are_counted_instance_by_instance(exact):
+    scene = synth.outlier_layout(
+        0, true_pairs=(6, 10), num_instances=(10, 20), num_correspondences=5000, exact=exact
+    )
+    counts = np.bincount(scene.labels()[scene.labels() >= 0], minlength=scene.num_instances)
+    assert_well_formed(scene)
+    assert len(scene.corr) == 5000
+    # A true pair may lie within reach of two instances that interpenetrate, and be labelled by either.
+    assert 6 <= np.median(counts) <= 10
+    assert 6 * scene.num_instances <= counts.sum() <= 10 * scene.num_instances
+    assert min(true_pairs_per_instance(scene)) >= 6
+    assert len(set(true_pairs_per_instance(scene))) > 1
+
+
+def test_true_pairs_and_ratio_differ_in_nothing_but_the_pairs():
+    by_ratio = synth.outlier_layout(3, num_instances=(2, 4))
+    by_pairs = synth.outlier_layout(3, num_instances=(2, 4), true_pairs=8)
+    assert by_pairs.tgt.tobytes() == by_ratio.tgt.tobytes()
+    assert by_pairs.inlier_ratio() == 8 * by_pairs.num_instances / len(by_pairs.corr)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"true_pairs": (6, 10)}, {"outlier_ratio": 0.5}])
+def test_outlier_layout_without_instances_is_pure_noise(kwargs):
+    scene = synth.outlier_layout(0, num_instances=0, num_correspondences=1500, **kwargs)
+    assert_well_formed(scene)
+    assert scene.poses.shape == (0, 4, 4)
+    assert scene.corr.shape == (1500, 2)
+    assert scene.tgt.shape == (1000, 3)
+    assert scene.inlier_ratio() == 0
+
+
+def test_jitter_can_be_told_in_spacings_of_the_source():
+    clear, noisy = (synth.outlier_layout(2, num_instances=3, jitter_pr=jitter) for jitter in (0, 0.25))
+    gaps = np.linalg.norm(clear.src[:, None] - clear.src, axis=2) + 1e9 * np.eye(1024)
+    noise = (noisy.tgt - clear.tgt)[: 3 * 1024]
+    assert noise.std() == pytest.approx(0.25 * gaps.min(axis=1).mean(), rel=0.05)
+    np.testing.assert_array_equal(noisy.tgt[3 * 1024 :], clear.tgt[3 * 1024 :])
 
 
 @pytest.mark.parametrize(
@@ -125,7 +172,12 @@ def test_instances_keep_their_distance():
     [
         ("outlier_ratio must lie", {"outlier_ratio": 1.0}),
         ("outlier_ratio must lie", {"outlier_ratio": (0.9, 0.5)}),
-        ("num_instances must be", {"num_instances": 0}),
+        ("num_instances must be", {"num_instances": -1}),
+        ("num_clutter must be at least 1", {"num_instances": 0, "num_clutter": 0}),
+        ("exclude each other", {"outlier_ratio": 0.9, "true_pairs": 8}),
+        ("true_pairs must be", {"true_pairs": 0}),
+        ("cannot give 5 instances 30", {"true_pairs": 30, "num_instances": 5, "num_correspondences": 100}),
+        ("cannot give 5 instances 30", {"true_pairs": 30, "num_instances": 5, "num_points": 20}),
         ("num_correspondences must be", {"num_correspondences": (10, 5)}),
         ("cannot give 20", {"outlier_ratio": 0.99, "num_instances": 20, "num_correspondences": 1000}),
         ("cannot give 1", {"outlier_ratio": 0.0, "num_instances": 1, "num_correspondences": 5000}),
@@ -133,6 +185,7 @@ def test_instances_keep_their_distance():
         ("must be an", {"shape": np.zeros((100, 2))}),
         ("at least two distinct", {"shape": np.ones((100, 3))}),
         ("jitter and num_clutter", {"jitter": -1.0}),
+        ("jitter and num_clutter", {"jitter_pr": -1.0}),
     ],
 )
 def test_outlier_layout_refuses_what_it_cannot_do(message, kwargs):
@@ -184,9 +237,10 @@ def test_mesh_sampling_is_uniform_by_area(tmp_path):
         synth.sample_mesh(path, 10, np.random.default_rng(0))
 
 
-def small_catalogue():
+def small_catalogue(num_points=1000):
     """Sparse clouds, so that the descriptors take a fraction of a second."""
-    return {name: synth.shape(name, 1000, np.random.default_rng(9)) for name in ("clamp", "mug", "valve")}
+    names = ("clamp", "mug", "valve")
+    return {name: synth.shape(name, num_points, np.random.default_rng(9)) for name in names}
 
 
 def stand_in(points, normals):
@@ -203,6 +257,7 @@ except ImportError:
     pass
 else:
     DESCRIPTORS["FPFH"] = None
+needs_open3d = pytest.mark.skipif("FPFH" not in DESCRIPTORS, reason="Open3D cannot be imported")
 each_descriptor = pytest.mark.parametrize("descriptors", DESCRIPTORS.values(), ids=DESCRIPTORS)
 
 
@@ -212,6 +267,7 @@ def test_ecc_layout_keeps_its_promises(descriptors):
     for seed in range(6):
         scene = synth.ecc_layout(seed, shapes=shapes, descriptors=descriptors)
         assert_well_formed(scene)
+        assert_in_the_octant(scene)
         assert 1 <= scene.num_instances <= 20
         assert scene.src.shape == (256, 3)
         assert len(scene.tgt) == 20 * 256 + 1000
@@ -230,6 +286,28 @@ def test_ecc_layout_is_determined_by_its_seed(descriptors):
     noisy = synth.ecc_layout(4, **options, descriptor_noise=0.3)
     assert noisy.tgt.tobytes() == clear.tgt.tobytes()
     assert noisy.inlier_ratio() < clear.inlier_ratio()
+
+
+def test_ecc_layout_names_the_distractors():
+    for seed in range(6):
+        scene = synth.ecc_layout(seed, shapes=small_catalogue(), descriptors=stand_in)
+        source = scene.name.split("-")[2]
+        assert set(scene.distractors) <= {"clamp", "mug", "valve"} - {source}
+        assert bool(scene.distractors) == (scene.num_instances < 20)
+
+
+def test_ecc_layout_without_its_source():
+    for seed in range(6):
+        scene = synth.ecc_layout(seed, shapes=small_catalogue(), descriptors=stand_in, source_present=False)
+        assert_well_formed(scene)
+        assert scene.poses.shape == (0, 4, 4)
+        assert scene.corr.shape == (6120, 2)
+        assert scene.inlier_ratio() == 0
+        assert scene.distractors
+        assert scene.name.split("-")[2] not in scene.distractors
+    shapes = {"mug": synth.shape("mug", 1000, np.random.default_rng(9))}
+    with pytest.raises(ValueError, match="at least two shapes"):
+        synth.ecc_layout(0, shapes=shapes, source_present=False)
 
 
 @each_descriptor
@@ -271,10 +349,11 @@ def test_ecc_layout_refuses_descriptors_that_are_none(descriptors, message):
         synth.ecc_layout(0, shapes=small_catalogue(), descriptors=descriptors)
 
 
-def test_ecc_layout_names_the_extra_that_it_needs(monkeypatch):
+@pytest.mark.parametrize("layout", [synth.ecc_layout, synth.fpfh_layout])
+def test_layouts_name_the_extra_that_they_need(layout, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(ImportError, match=r"pip install 'ibi_rs\[features\]'"):
-        synth.ecc_layout(0)
+        layout(0)
 
 
 def test_ecc_layout_refuses_empty_folders_and_sparse_shapes(tmp_path):
@@ -283,6 +362,87 @@ def test_ecc_layout_refuses_empty_folders_and_sparse_shapes(tmp_path):
     sparse = {"dots": (np.random.default_rng(0).normal(size=(50, 3)), None)}
     with pytest.raises(ValueError, match="fewer than num_points"):
         synth.ecc_layout(0, shapes=sparse)
+
+
+@needs_open3d
+def test_fpfh_layout_keeps_its_promises():
+    shapes = small_catalogue(1024)
+    for seed in range(4):
+        scene = synth.fpfh_layout(seed, shapes=shapes)
+        k = scene.num_instances
+        assert_well_formed(scene)
+        assert 5 <= k <= 12
+        assert least_gap(scene.poses[:, :3, 3]) >= 1.6
+        assert ((scene.poses[:, :3, 3] >= 1) & (scene.poses[:, :3, 3] <= 9)).all()
+        assert len(scene.src) == 1024
+        assert len(scene.tgt) == 717 * (k + 4) + 1000
+        assert len(scene.corr) == 256 * (k + 4) + 300
+        counts = np.bincount(np.minimum(scene.corr[:, 1] // 717, k + 4), minlength=k + 5)
+        np.testing.assert_array_equal(counts, [256] * (k + 4) + [300])
+        assert len(np.unique(scene.corr[:, 1])) == len(scene.corr)
+        halves = np.array_split(scene.corr[:, 1], 2)
+        assert abs(halves[0].mean() - halves[1].mean()) < 0.1 * len(scene.tgt)
+        assert 0.005 < scene.inlier_ratio() < 0.16
+        assert scene.similarity.shape == (len(scene.corr),)
+        for normals, points in ((scene.src_normals, scene.src), (scene.tgt_normals, scene.tgt)):
+            assert normals.shape == points.shape
+            np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+        assert len(scene.distractors) == 4
+        assert scene.name.split("-")[2] not in scene.distractors
+
+
+@needs_open3d
+def test_fpfh_layout_is_determined_by_its_seed():
+    options = {"shapes": small_catalogue(1024), "num_instances": 3, "num_distractors": 1}
+    assert_same_bytes(synth.fpfh_layout(1, **options), synth.fpfh_layout(1, **options))
+    assert synth.fpfh_layout(1, **options).tgt.tobytes() != synth.fpfh_layout(2, **options).tgt.tobytes()
+
+
+@needs_open3d
+def test_fpfh_instances_are_parts_of_the_model():
+    scene = synth.fpfh_layout(0, shapes=small_catalogue(1024), jitter=0.0, num_instances=3)
+    parts = []
+    for k, pose in enumerate(scene.poses):
+        back = (scene.tgt[717 * k : 717 * (k + 1)] - pose[:3, 3]) @ pose[:3, :3]
+        dist = np.linalg.norm(back[:, None] - scene.src, axis=2)
+        assert dist.min(axis=1).max() < 1e-9
+        parts.append(set(dist.argmin(axis=1).tolist()))
+    assert [len(part) for part in parts] == [717, 717, 717]
+    assert len(parts[0] & parts[1]) < 717
+
+
+@needs_open3d
+def test_fpfh_distractors_are_of_other_categories():
+    clouds = small_catalogue(1024)
+    shapes = {"tool/clamp": clouds["clamp"], "tool/valve": clouds["valve"], "cup/mug": clouds["mug"]}
+    small = {"num_instances": 1, "num_distractors": 2, "num_clutter": 300}
+    for seed in range(6):
+        scene = synth.fpfh_layout(seed, shapes=shapes, **small)
+        model = scene.name.split("-")[2].partition("/")[0]
+        assert model not in {name.partition("/")[0] for name in scene.distractors}
+        assert len(scene.distractors) == 2
+    tools = {name: cloud for name, cloud in shapes.items() if name.startswith("tool")}
+    with pytest.raises(ValueError, match="no shape of another category"):
+        synth.fpfh_layout(0, shapes=tools)
+    assert synth.fpfh_layout(0, shapes=tools, num_instances=1, num_distractors=0).distractors == ()
+
+
+@needs_open3d
+@pytest.mark.parametrize(
+    ("message", "kwargs"),
+    [
+        ("fewer than num_points", {}),
+        ("kept at most 1", {"kept": 1.1}),
+        ("kept at most 1", {"kept": 0.01}),
+        ("jitter and num_distractors", {"jitter": -1.0}),
+        ("num_instances must be", {"num_instances": 0}),
+        ("key points must be among", {"num_key_points": 800}),
+        ("key points must be among", {"num_clutter": 200}),
+    ],
+)
+def test_fpfh_layout_refuses_what_it_cannot_do(message, kwargs):
+    with pytest.raises(ValueError, match=message):
+        synth.fpfh_layout(0, shapes=small_catalogue(), **kwargs)
 
 
 def test_every_example_mesh_can_be_sampled():

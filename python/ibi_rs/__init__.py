@@ -6,10 +6,24 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 from ibi_rs import metrics, plot, synth
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._register import register
-from ibi_rs.params import Gsac, Gtm, InlierCount, Irls, LocalGtm, None_, Off, Overlap, Params, Ransac, Voting
+from ibi_rs.params import (
+    Evidence,
+    Gsac,
+    Gtm,
+    InlierCount,
+    Irls,
+    LocalGtm,
+    None_,
+    Off,
+    Overlap,
+    Params,
+    Ransac,
+    Voting,
+)
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
 
 __all__ = [
+    "Evidence",
     "Gsac",
     "Gtm",
     "InlierCount",

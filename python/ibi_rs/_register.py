@@ -131,10 +131,11 @@ def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:
 
 
 def _registration(raw: dict[str, Any], params: Params) -> Registration:
-    columns = ("target_from_source", "score", "overlap", "inlier_rmse", "inliers", "round")
+    numbers = ("score", "overlap", "closeness", "back_fit", "evidence", "inlier_rmse")
     poses = []
-    for matrix, score, overlap, inlier_rmse, inliers, index in zip(*(raw[c] for c in columns), strict=True):
-        poses.append(Pose(matrix, float(score), float(overlap), float(inlier_rmse), inliers, int(index)))
+    for k, matrix in enumerate(raw["target_from_source"]):
+        measured = {name: float(raw[name][k]) for name in numbers}
+        poses.append(Pose(matrix, **measured, inliers=raw["inliers"][k], round=int(raw["round"][k])))
     return Registration(
         poses,
         labels=raw["labels"],

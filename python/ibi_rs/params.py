@@ -63,6 +63,8 @@ class LocalGtm:
         Correspondences nearer to each other than this, on either side, say nothing about a pose, in pr; >= 0.
     normal_tolerance
         With normals: how far the angles between two oriented points may differ, in cosine; > 0.
+    second_order
+        Whether an edge is weighed by what its two ends have in common, or by its own rigidity alone.
     n_gtm
         N_gtm: generations of the replicator; at least 1.
 
@@ -75,7 +77,8 @@ class LocalGtm:
     variant: ClassVar[str] = "local_gtm"
     tau_pr: float = 1.0
     min_length_pr: float = 1.0
-    normal_tolerance: float = 0.35
+    normal_tolerance: float = 0.5
+    second_order: bool = True
     n_gtm: int = 20
 
 
@@ -187,6 +190,24 @@ class Overlap:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """HV ``evidence``: accepts a pose if it is probably right, judged by its support.
+
+    Parameters
+    ----------
+    t_score
+        The probability to exceed, 0 to 1.
+    exclusive
+        Whether target points that an accepted instance explains support no later one, so that an instance is
+        found once.
+    """
+
+    variant: ClassVar[str] = "evidence"
+    t_score: float = 0.5
+    exclusive: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
 class InlierCount:
     """HV ``inlier_count``: accepts a pose if enough alive correspondences have a residual below ``t_he``.
 
@@ -210,7 +231,7 @@ class None_:
 Scs = Gtm | LocalGtm
 Ce = Voting | Off
 Te = Gsac | Irls | Ransac
-Hv = Overlap | InlierCount | None_
+Hv = Evidence | Overlap | InlierCount | None_
 Refine = Literal["none", "icp"]
 Removal = Literal["dense", "inliers"]
 
@@ -243,6 +264,9 @@ class Params:
     min_normal_cos
         Least cosine between the normals of an inlier's two points, and of overlapping points, -1 to 1; with a
         viewpoint, points that face away from it count in no overlap. None leaves normals out of both.
+    oriented_normals
+        Whether the normals are oriented: outwards on the source, towards the camera on the target. If not,
+        they are compared up to sign, and the viewpoint cannot tell which source points can be seen.
     t_s
         t_s: a run ends when fewer seeds than this are found; at least 3.
     scs, ce, te, hv
@@ -255,6 +279,9 @@ class Params:
     n_contest
         A contest lasts this many rounds: at its end the hypotheses that passed validation become instances,
         best value first. 1: each at once, as it is found. At least 1.
+    joint_check
+        Whether at the end all accepted poses compete for the target at once: each point of it belongs to the
+        nearest pose, and poses that fail validation on what is their own are dropped.
     removal
         Which correspondences a round removes; ``"dense"``: those that the enhancement ranked; ``"inliers"``:
         those within 2 ``t_he`` of an accepted instance and those whose target point it explains, while the
@@ -282,19 +309,21 @@ class Params:
 
     seed: int = 0
     resolution: float | None = None
-    delta_r_pr: float = 10.0
-    t_he_pr: float = 3.0
+    delta_r_pr: float = 1.0
+    t_he_pr: float = 1.5
     d_op_pr: float = 1.5
-    min_normal_cos: float | None = None
-    t_s: int = 5
-    scs: Scs = Gtm()
+    min_normal_cos: float | None = 0.3
+    oriented_normals: bool = False
+    t_s: int = 4
+    scs: Scs = LocalGtm()
     ce: Ce = Voting()
-    te: Te = Gsac()
-    hv: Hv = Overlap()
-    refine: Refine = "none"
-    n_contest: int = 1
-    removal: Removal = "dense"
-    max_rejections: int | None = None
+    te: Te = Irls()
+    hv: Hv = Evidence()
+    refine: Refine = "icp"
+    n_contest: int = 60
+    joint_check: bool = True
+    removal: Removal = "inliers"
+    max_rejections: int | None = 60
     max_rounds: int | None = None
     max_instances: int | None = None
     timeout_s: float | None = None

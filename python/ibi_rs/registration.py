@@ -21,9 +21,18 @@ class Pose:
     target_from_source : (4, 4) float64
         Moves source points onto this instance; acts on column vectors, translation in data units.
     score : float
-        What poses are ranked by, 0 to 1: the overlap.
+        The probability that the pose is right, judged by ``evidence`` and ``closeness``, 0 to 1; what poses
+        are ranked by.
     overlap : float
         Share of source points within ``d_op`` of a target point, 0 to 1.
+    closeness : float
+        Mean over the visible source points of max(0, 1 - d / 2 ``d_op``), d being the distance to the nearest
+        target point that no other pose owns, 0 to 1.
+    back_fit : float
+        Mean over the correspondences whose target point lies within 2 ``d_op`` of this instance, and belongs
+        to no other pose, of 1 - d / 2 ``d_op``, d being that distance, 0 to 1.
+    evidence : float
+        -log10 of the chance that as many correspondences would agree if they knew nothing of their targets.
     inlier_rmse : float
         Root mean square residual of the inliers in data units; 0 without inliers.
     inliers : (I,) int64
@@ -35,6 +44,9 @@ class Pose:
     target_from_source: npt.NDArray[np.float64]
     score: float
     overlap: float
+    closeness: float
+    back_fit: float
+    evidence: float
     inlier_rmse: float
     inliers: npt.NDArray[np.int64] = field(repr=False)
     round: int

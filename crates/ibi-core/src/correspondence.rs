@@ -1,10 +1,12 @@
 //! Putative correspondences, and which of them are still alive.
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 
 use crate::error::{Argument, Error};
 use crate::kernels::columns::Columns;
-use crate::kernels::graph::PairNormals;
+use crate::kernels::graph::{PairNormals, up_to_sign};
+use crate::kernels::par;
+use crate::params::Params;
 use crate::scene::{PreparedCloud, Scene, check_points};
 
 /// Correspondences as a user hands them in: nothing is checked until a [`crate::Registrar`] takes them.
@@ -42,21 +44,16 @@ impl Correspondences {
         self
     }
 
-    /// The normals at both points of each pair; where points are given instead of rows, those of the nearest
-    /// points of the clouds.
-    fn normals(&self, scene: &Scene<'_>) -> Option<PairNormals> {
-        let side = |cloud: &PreparedCloud<'_>, column: usize| {
-            let normals = cloud.normals.as_ref()?;
-            let rows: Vec<usize> = match &self.pairs {
-                Pairs::Rows(rows) => rows.iter().map(|row| row[column]).collect(),
-                Pairs::Points(points) => {
-                    let nearest = |pair: &[Point3<f64>; 2]| cloud.neighbors.nearest(&pair[column]);
-                    points.iter().filter_map(nearest).map(|(row, _)| row as usize).collect()
-                }
-            };
-            Some(rows.into_iter().map(|row| normals[row].cast()).collect())
+    /// Rows of the clouds, source and target; where points are given instead, those of the nearest points.
+    fn rows(&self, scene: &Scene<'_>) -> (Vec<u32>, Vec<u32>) {
+        let side = |cloud: &PreparedCloud<'_>, column: usize| match &self.pairs {
+            Pairs::Rows(rows) => rows.iter().map(|row| row[column] as u32).collect(),
+            Pairs::Points(points) => {
+                let nearest = |pair: &[Point3<f64>; 2]| cloud.neighbors.nearest(&pair[column]);
+                points.iter().filter_map(nearest).map(|(row, _)| row).collect()
+            }
         };
-        Some(PairNormals { source: side(scene.source, 0)?, target: side(&scene.target, 1)? })
+        (side(scene.source, 0), side(&scene.target, 1))
     }
 
     /// M, the number of correspondences.
@@ -82,6 +79,10 @@ pub struct PointPairs {
     pub source: Vec<Point3<f64>>,
     /// q_i, in data units.
     pub target: Vec<Point3<f64>>,
+    /// Row of the source point, or of the one nearest to p_i where points were given.
+    pub source_rows: Vec<u32>,
+    /// Row of the target point, or of the one nearest to q_i.
+    pub target_rows: Vec<u32>,
     /// The same pairs as centred `f32` columns in multiples of the resolution.
     pub columns: Columns,
     /// How alike the two descriptors of each pair are; larger is better.
@@ -91,7 +92,7 @@ pub struct PointPairs {
 }
 
 impl PointPairs {
-    pub(crate) fn new(given: &Correspondences, scene: &Scene<'_>) -> Result<Self, Error> {
+    pub(crate) fn new(given: &Correspondences, scene: &Scene<'_>, oriented: bool) -> Result<Self, Error> {
         let len = given.len();
         if len > u32::MAX as usize {
             return Err(Error::TooMany { argument: Argument::Corr, len });
@@ -105,9 +106,39 @@ impl PointPairs {
         };
         check_points(&source, Argument::Corr)?;
         check_points(&target, Argument::Corr)?;
+        let (source_rows, target_rows) = given.rows(scene);
         let columns = Columns::new(&source, &target, scene.resolution);
-        let normals = given.normals(scene);
-        Ok(Self { source, target, columns, similarity: given.similarity.clone(), normals })
+        let normals = scene.source.normals.as_ref().zip(scene.target.normals.as_ref()).map(|(s, t)| {
+            let look_up = |normals: &[Vector3<f64>], rows: &[u32]| {
+                rows.iter().map(|&row| normals[row as usize].cast()).collect()
+            };
+            PairNormals { source: look_up(s, &source_rows), target: look_up(t, &target_rows), oriented }
+        });
+        let similarity = given.similarity.clone();
+        Ok(Self { source, target, source_rows, target_rows, columns, similarity, normals })
+    }
+
+    /// For each source point the share of the correspondences whose source point lies within `t_he` of it (and
+    /// agrees in its normal, where normals count): how likely a correspondence that knows nothing of its target
+    /// point would agree there.
+    pub(crate) fn chances(&self, scene: &Scene<'_>, params: &Params) -> Vec<f32> {
+        let source = scene.source;
+        let t_he = params.t_he_pr * scene.resolution;
+        let mut uses = vec![0_u32; source.points.len()];
+        for &row in &self.source_rows {
+            uses[row as usize] += 1;
+        }
+        let normals = source.normals.as_deref().zip(params.min_normal_cos);
+        let chance = |row: usize| {
+            let alike = |&other: &u32| {
+                normals.is_none_or(|(n, min_cos)| {
+                    up_to_sign(n[row].dot(&n[other as usize]), params.oriented_normals) >= min_cos
+                })
+            };
+            let near = source.neighbors.within(&source.points[row], t_he).filter(alike);
+            near.map(|other| uses[other as usize]).sum::<u32>() as f32 / self.len().max(1) as f32
+        };
+        par::map(source.points.len(), 64, chance)
     }
 
     /// M, the number of correspondences.
@@ -170,6 +201,13 @@ pub struct Alive {
 impl Alive {
     pub(crate) fn all(pairs: &PointPairs) -> Self {
         Self { ids: (0..pairs.len() as u32).collect(), columns: pairs.columns.clone() }
+    }
+
+    /// Those of `pairs` that `keep` keeps.
+    pub(crate) fn filtered(pairs: &PointPairs, keep: impl Fn(u32) -> bool) -> Self {
+        let ids: Vec<u32> = (0..pairs.len() as u32).filter(|&id| keep(id)).collect();
+        let columns = pairs.columns.gather(&ids);
+        Self { ids, columns }
     }
 
     /// Their ids, ascending.

@@ -23,6 +23,7 @@
 mod correspondence;
 mod error;
 mod interrupt;
+mod joint;
 pub mod kernels;
 pub mod metrics;
 mod params;

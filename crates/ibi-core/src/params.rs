@@ -6,11 +6,11 @@
 use crate::error::Error;
 use crate::kernels::compatibility::Payoff;
 use crate::stages::ce::{Ce, Voting};
-use crate::stages::hv::{Hv, Overlap};
+use crate::stages::hv::{Evidence, Hv, Overlap};
 use crate::stages::scs::{Gtm, LocalGtm, Scs};
 use crate::stages::te::{Gsac, Irls, Te};
 
-/// How a registration runs. The default is [`Params::paper_synthetic`] with `t_he_pr` 3.
+/// How a registration runs.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(
     feature = "serde",
@@ -21,6 +21,7 @@ pub struct Params {
     /// Key of all random streams. The same seed gives the same bits, for any number of threads.
     pub seed: u64,
     /// pr in data units; `None` estimates it from the clouds. > 0.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub resolution: Option<f64>,
     /// `delta_r` of Eq. 5: how fast payoff and votes fall with the rigidity, in pr. > 0.
     pub delta_r_pr: f64,
@@ -30,7 +31,11 @@ pub struct Params {
     pub d_op_pr: f64,
     /// Least cosine between the normals of an inlier's two points, and of overlapping points; with a viewpoint,
     /// points that face away from it count in no overlap. `None` leaves normals out of both. -1 to 1.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub min_normal_cos: Option<f64>,
+    /// Whether the normals are oriented: outwards on the source, towards the camera on the target. If not, they are
+    /// compared up to sign, and the viewpoint cannot tell which source points can be seen.
+    pub oriented_normals: bool,
     /// `t_s`: a run ends when fewer seeds than this are found. At least 3.
     pub t_s: u32,
     /// Seed correspondence selection.
@@ -46,15 +51,22 @@ pub struct Params {
     /// A contest lasts this many rounds: at its end the hypotheses that passed validation become instances, best
     /// value first. 1: each at once, as it is found. At least 1.
     pub n_contest: u32,
+    /// Whether at the end all accepted poses compete for the target at once, and those that fail validation on what
+    /// is nearest to them are dropped.
+    pub joint_check: bool,
     /// Which correspondences a round removes.
     pub removal: Removal,
-    /// A run ends after this many rounds without a new instance; `None`: no limit.
+    /// A run ends after this many rounds in which nothing new passed validation; `None`: no limit.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub max_rejections: Option<u32>,
     /// A run ends after this many rounds; `None`: no limit.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub max_rounds: Option<u32>,
     /// A run ends with this many instances; `None`: no limit.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub max_instances: Option<u32>,
     /// A run ends after this many seconds and keeps what it has; `None`: no limit. >= 0.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub timeout_s: Option<f64>,
 }
 
@@ -67,8 +79,8 @@ pub enum Refine {
     #[default]
     None,
     /// Iterative closest points within 2 `d_op`: point-to-plane where `min_normal_cos` lets normals count,
-    /// else point-to-point. A hypothesis that fewer than `t_s` alive correspondences agree with afterwards is
-    /// dropped.
+    /// else point-to-point. The polished hypothesis stays if it is validated better than the one before, and if at
+    /// least `t_s` alive correspondences still agree with it.
     Icp,
 }
 
@@ -82,13 +94,32 @@ pub enum Removal {
     #[default]
     Dense,
     /// When an instance is accepted, the alive correspondences within 2 `t_he` of it and those whose target point
-    /// it explains. The seeds of a round, accepted or not, may not lead again.
+    /// it explains. The seeds of a round may not lead again, nor may the inliers of a hypothesis that passed.
     Inliers,
 }
 
 impl Default for Params {
+    /// Not of the paper: all correspondences play, one neighbourhood at a time, in a second-order compatibility graph;
+    /// hypotheses are polished on the clouds, judged by how unlikely their support is by chance, and compete for the
+    /// scene before and after they are accepted. For scenes seen whole or nearly so; normals help where both clouds
+    /// have them.
     fn default() -> Self {
-        Self { t_he_pr: 3.0, ..Self::paper_synthetic() }
+        Self {
+            delta_r_pr: 1.0,
+            t_he_pr: 1.5,
+            d_op_pr: 1.5,
+            min_normal_cos: Some(0.3),
+            t_s: 4,
+            scs: LocalGtm::default().into(),
+            te: Irls::default().into(),
+            hv: Evidence::default().into(),
+            refine: Refine::Icp,
+            n_contest: 60,
+            joint_check: true,
+            removal: Removal::Inliers,
+            max_rejections: Some(60),
+            ..Self::paper_synthetic()
+        }
     }
 }
 
@@ -103,6 +134,7 @@ impl Params {
             t_he_pr: 10.0,
             d_op_pr: 1.5,
             min_normal_cos: None,
+            oriented_normals: false,
             t_s: 5,
             scs: Gtm { n_downsample: 1024, n_gtm: 20, payoff: Payoff::Gaussian }.into(),
             ce: Voting { n_vot: 300 }.into(),
@@ -110,6 +142,7 @@ impl Params {
             hv: Overlap { t_overlap: 0.85, exclusive: false }.into(),
             refine: Refine::None,
             n_contest: 1,
+            joint_check: false,
             removal: Removal::Dense,
             max_rejections: None,
             max_rounds: None,
@@ -142,8 +175,10 @@ impl Params {
             t_he_pr: 2.0,
             d_op_pr: 1.5,
             min_normal_cos: Some(0.5),
+            oriented_normals: true,
             t_s: 4,
-            scs: LocalGtm { tau_pr: 2.0, min_length_pr: 2.0, normal_tolerance: 0.3, n_gtm: 20 }.into(),
+            scs: LocalGtm { tau_pr: 2.0, min_length_pr: 2.0, normal_tolerance: 0.3, ..LocalGtm::default() }
+                .into(),
             te: Irls::default().into(),
             refine: Refine::Icp,
             hv: Overlap { t_overlap: 0.35, exclusive: true }.into(),
@@ -178,6 +213,31 @@ impl Params {
 
 /// Lengths below or above this many data units, or pr, are mistakes, and their squares leave the floats.
 const LENGTHS: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
+
+/// Reads an option, in which the word `none` stands for no value: TOML cannot say it otherwise.
+#[cfg(feature = "serde")]
+fn none_or<'de, D, T>(deserializer: D) -> Result<Option<T>, D::Error>
+where
+    D: serde::Deserializer<'de>,
+    T: serde::Deserialize<'de>,
+{
+    #[derive(serde::Deserialize)]
+    #[serde(untagged, expecting = "a number or \"none\"")]
+    enum Given<T> {
+        Value(T),
+        Word(Word),
+        Null(()),
+    }
+    #[derive(serde::Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    enum Word {
+        None,
+    }
+    Ok(match serde::Deserialize::deserialize(deserializer)? {
+        Given::Value(value) => Some(value),
+        Given::Word(Word::None) | Given::Null(()) => None,
+    })
+}
 
 fn check(name: &'static str, value: f64, fine: bool, allowed: &'static str) -> Result<(), Error> {
     if fine { Ok(()) } else { Err(Error::Param { name, value, allowed }) }

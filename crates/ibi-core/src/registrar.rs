@@ -7,6 +7,7 @@ use std::time::Instant;
 use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
+use crate::joint::joint_check;
 use crate::kernels::par::Pool;
 use crate::params::Params;
 use crate::registration::{Registration, Round, StopReason};
@@ -165,7 +166,7 @@ impl<'a> Registrar<'a> {
         let (scene, pairs) = pool.install(|| {
             let target = PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals)?;
             let scene = Scene::new(&self.source, target, self.params.resolution)?;
-            let pairs = PointPairs::new(correspondences, &scene)?;
+            let pairs = PointPairs::new(correspondences, &scene, self.params.oriented_normals)?;
             Ok::<_, Error>((scene, pairs))
         })?;
         let interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
@@ -221,10 +222,17 @@ impl<'a> Registrar<'a> {
         }
         let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
         let mut estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
-        estimate.hypothesis = timed(&mut times.refine_s, || context.refined(estimate.hypothesis?));
-        let verdict = estimate
-            .hypothesis
-            .map(|hypothesis| timed(&mut times.hv_s, || self.hv().validate(&context, &hypothesis)));
+        let mut judged = estimate.hypothesis.map(|hypothesis| {
+            timed(&mut times.hv_s, || (hypothesis, self.hv().validate(&context, &hypothesis)))
+        });
+        if let Some(refined) = timed(&mut times.refine_s, || context.refined(estimate.hypothesis?)) {
+            let verdict = timed(&mut times.hv_s, || self.hv().validate(&context, &refined));
+            if judged.is_none_or(|(_, before)| verdict.value >= before.value) {
+                judged = Some((refined, verdict));
+            }
+        }
+        estimate.hypothesis = judged.map(|(hypothesis, _)| hypothesis);
+        let verdict = judged.map(|(_, verdict)| verdict);
         state.problem.interrupt.check()?;
 
         state.conclude(&self.params, &seeds, &dense, &estimate, verdict);
@@ -238,6 +246,7 @@ impl<'a> Registrar<'a> {
     /// instance and claims its scene points; the others are measured again on what is left, and so on. Those far
     /// below the best stay for the next contest, in which a better pose of the same instance may turn up.
     fn settle(&self, state: &mut State<'_>) -> u32 {
+        let start = Instant::now();
         let mut best_value = None;
         let mut num_accepted = 0;
         while self.params.max_instances.is_none_or(|limit| state.num_found() < limit) {
@@ -248,6 +257,7 @@ impl<'a> Registrar<'a> {
             num_accepted += 1;
         }
         state.rounds_since_settling = 0;
+        state.timings.hv_s += start.elapsed().as_secs_f64();
         num_accepted
     }
 
@@ -257,6 +267,9 @@ impl<'a> Registrar<'a> {
         let pool = Arc::clone(&state.pool);
         pool.install(|| {
             while self.settle(&mut state) > 0 {}
+            if self.params.joint_check {
+                joint_check(&state.problem, &self.params, self.hv(), &mut state.found);
+            }
             state.into_registration(&self.params, stop_reason)
         })
     }

@@ -30,10 +30,18 @@ pub struct Registration {
 pub struct Pose {
     /// Moves source points onto this instance; data units.
     pub target_from_source: Isometry3<f64>,
-    /// What poses are ranked by, 0 to 1: the overlap.
+    /// The probability that the pose is right, judged by `evidence` and `closeness`; what poses are ranked by.
     pub score: f64,
     /// Share of source points within `d_op` of a target point, 0 to 1.
     pub overlap: f64,
+    /// Mean over the visible source points of max(0, 1 - d / 2 `d_op`), d being the distance to the nearest target
+    /// point that no other pose owns, 0 to 1.
+    pub closeness: f64,
+    /// Mean over the correspondences whose target point lies within 2 `d_op` of this instance, and of no other
+    /// pose, of 1 - d / 2 `d_op`, d being that distance, 0 to 1.
+    pub back_fit: f64,
+    /// -log10 of the chance that as many correspondences would agree if they knew nothing of their targets.
+    pub evidence: f64,
     /// Root mean square residual of the inliers, data units; 0 without inliers.
     pub inlier_rmse: f64,
     /// Ids of all correspondences with a residual below `t_he`, ascending. An id may be an inlier of several

@@ -8,10 +8,12 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use crate::error::{Argument, Error};
 use crate::kernels::icp::icp;
 use crate::kernels::neighbors::Neighbors;
-use crate::kernels::overlap::{Contact, Place, Surface, places};
+use crate::kernels::overlap::{Contact, Place, Surface, chance_fit, fit, places};
 use crate::kernels::par;
+use crate::kernels::rng::Rng;
 use crate::metrics::diameter;
 use crate::params::Params;
+use crate::stages::Stage;
 
 /// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
 #[derive(Debug, Clone, Default)]
@@ -70,6 +72,12 @@ pub struct PreparedCloud<'a> {
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
     pub extent: f64,
+    /// Centre of the bounding box; no point is farther from it than half the extent.
+    pub centre: Point3<f64>,
+    /// A few points that stand for all, where a mean over the cloud is wanted: [`PROBE_POINTS`] drawn at random.
+    pub(crate) probe: Probe,
+    /// Fewer still, for a first glance.
+    scout: Probe,
     diameter: OnceLock<f64>,
 }
 
@@ -92,7 +100,7 @@ impl<'a> PreparedCloud<'a> {
             .as_deref()
             .map(|rows| normalised(rows, normals, points.len(), argument))
             .transpose()?;
-        let extent = extent(points);
+        let (centre, extent) = bounding_box(points);
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
         }
@@ -100,11 +108,14 @@ impl<'a> PreparedCloud<'a> {
         let spacing = neighbors.mean_spacing(points);
         Ok(Self {
             points: points.clone(),
-            normals: unit_normals,
             viewpoint: cloud.viewpoint,
             neighbors,
             spacing,
             extent,
+            centre,
+            probe: Probe::new(points, unit_normals.as_deref(), PROBE_POINTS),
+            scout: Probe::new(points, unit_normals.as_deref(), SCOUT_POINTS),
+            normals: unit_normals,
             diameter: OnceLock::new(),
         })
     }
@@ -117,8 +128,40 @@ impl PreparedCloud<'_> {
         *self.diameter.get_or_init(|| diameter(&self.points))
     }
 
-    fn surface(&self, oriented: bool) -> Surface<'_> {
-        Surface { points: &self.points, normals: self.normals.as_deref().filter(|_| oriented) }
+    /// An upper bound of how far two poses move a point of this cloud apart, data units.
+    #[must_use]
+    pub(crate) fn displacement(&self, a: &Isometry3<f64>, b: &Isometry3<f64>) -> f64 {
+        (a * self.centre - b * self.centre).norm() + 0.5 * self.extent * a.rotation.angle_to(&b.rotation)
+    }
+
+    fn surface(&self, with_normals: bool) -> Surface<'_> {
+        Surface { points: &self.points, normals: self.normals.as_deref().filter(|_| with_normals) }
+    }
+}
+
+/// How many points stand for a cloud: the mean of so many distances is good to a hundredth.
+const PROBE_POINTS: usize = 256;
+const SCOUT_POINTS: usize = 64;
+
+/// Points drawn from a cloud, with their normals.
+#[derive(Debug)]
+pub(crate) struct Probe {
+    points: Vec<Point3<f64>>,
+    normals: Option<Vec<Vector3<f64>>>,
+}
+
+impl Probe {
+    fn new(points: &[Point3<f64>], normals: Option<&[Vector3<f64>]>, count: usize) -> Self {
+        let all: Vec<u32> = (0..points.len() as u32).collect();
+        let rows = Rng::new(0, 0, 0).sample(&all, count);
+        Self {
+            points: rows.iter().map(|&row| points[row as usize]).collect(),
+            normals: normals.map(|normals| rows.iter().map(|&row| normals[row as usize]).collect()),
+        }
+    }
+
+    fn surface(&self, with_normals: bool) -> Surface<'_> {
+        Surface { points: &self.points, normals: self.normals.as_deref().filter(|_| with_normals) }
     }
 }
 
@@ -172,42 +215,90 @@ impl Scene<'_> {
         places(&source, &target, &self.target.neighbors, target_from_source, &contact)
     }
 
-    /// Which of `points` (of the target) lie within `d_op` of the moved source.
+    /// The fit of the moved source to the target points that are not `claimed`, within a reach of 2 `d_op`.
     #[must_use]
-    pub fn explained(
+    pub fn fit(&self, params: &Params, target_from_source: &Isometry3<f64>, claimed: Option<&[bool]>) -> f64 {
+        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let source = self.source.probe.surface(params.min_normal_cos.is_some());
+        fit(&source, &target, &self.target.neighbors, target_from_source, &contact, claimed)
+    }
+
+    /// The fit that chance gives a pose somewhere on the target.
+    #[must_use]
+    pub fn chance_fit(&self, params: &Params) -> f64 {
+        let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let rng = Rng::new(params.seed, 0, Stage::Hv as u32);
+        chance_fit(&source, &target, &self.target.neighbors, &contact, rng, CHANCE_SAMPLES)
+    }
+
+    /// For each of `points` (of the target) the nearest point of the moved source, if within `distance_pr`: its row
+    /// and the distance in data units. A point within `d_op` is explained by the pose.
+    #[must_use]
+    pub fn nearest_source(
         &self,
-        params: &Params,
+        distance_pr: f64,
         target_from_source: &Isometry3<f64>,
         points: &[Point3<f64>],
-    ) -> Vec<bool> {
-        let d_op = params.d_op_pr * self.resolution;
+    ) -> Vec<Option<(u32, f64)>> {
+        let distance = distance_pr * self.resolution;
         let source_from_target = target_from_source.inverse();
-        let (centre, radius) = (self.source.points[0], self.source.extent + d_op);
+        // Far points need no search.
+        let (centre, radius) = (self.source.centre, 0.5 * self.source.extent + distance);
         par::map(points.len(), 256, |i| {
             let back = source_from_target * points[i];
-            // Far points need no search: no source point is farther from the first than the extent.
-            (back - centre).norm_squared() <= radius * radius
-                && self.source.neighbors.nearest(&back).is_some_and(|(_, dist_sq)| dist_sq <= d_op * d_op)
+            if (back - centre).norm_squared() > radius * radius {
+                return None;
+            }
+            let (row, dist_sq) = self.source.neighbors.nearest(&back)?;
+            (dist_sq <= distance * distance).then(|| (row, dist_sq.sqrt()))
         })
+    }
+
+    /// Whether a first glance shows that refinement cannot rescue a pose. Never where only one side is seen: there
+    /// right poses fit little too.
+    pub(crate) fn is_hopeless(&self, params: &Params, target_from_source: &Isometry3<f64>) -> bool {
+        if self.is_one_sided(params) {
+            return false;
+        }
+        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let source = self.source.scout.surface(params.min_normal_cos.is_some());
+        fit(&source, &target, &self.target.neighbors, target_from_source, &contact, None) < HOPELESS
     }
 
     /// The pose polished on the two clouds by ICP within 2 `d_op`.
     #[must_use]
     pub fn icp(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
-        let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let (mut source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        // From one side few points are seen, and they are needed all.
+        if !self.is_one_sided(params) {
+            source = self.source.probe.surface(params.min_normal_cos.is_some());
+        }
         icp(&source, &target, &self.target.neighbors, target_from_source, &contact, ICP_STEPS)
     }
 
+    /// Whether source points that face away from the viewpoint are left out.
+    pub(crate) fn is_one_sided(&self, params: &Params) -> bool {
+        let with_normals = params.min_normal_cos.is_some() && self.source.normals.is_some();
+        with_normals && params.oriented_normals && self.target.viewpoint.is_some()
+    }
+
     fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact) {
-        let oriented = params.min_normal_cos.is_some();
+        let with_normals = params.min_normal_cos.is_some();
         let contact = Contact {
             distance: distance_pr * self.resolution,
             min_normal_cos: params.min_normal_cos.unwrap_or(-1.0),
+            oriented: params.oriented_normals,
             viewpoint: self.target.viewpoint,
         };
-        (self.source.surface(oriented), self.target.surface(oriented), contact)
+        (self.source.surface(with_normals), self.target.surface(with_normals), contact)
     }
 }
+
+/// Refinement rescues no pose that fits less than this.
+const HOPELESS: f64 = 0.2;
+
+/// Enough to know the fit by chance to a hundredth.
+const CHANCE_SAMPLES: usize = 1000;
 
 /// Steps of a refinement: point-to-plane is done after five or six.
 const ICP_STEPS: u32 = 8;
@@ -241,8 +332,9 @@ fn normalised(
     rows.iter().enumerate().map(unit).collect()
 }
 
-fn extent(points: &[Point3<f64>]) -> f64 {
-    let Some(&first) = points.first() else { return 0.0 };
+/// Centre and diagonal of the bounding box.
+fn bounding_box(points: &[Point3<f64>]) -> (Point3<f64>, f64) {
+    let Some(&first) = points.first() else { return (Point3::origin(), 0.0) };
     let (low, high) = points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)));
-    (high - low).norm()
+    (nalgebra::center(&low, &high), (high - low).norm())
 }

@@ -8,13 +8,15 @@ use nalgebra::Isometry3;
 
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
+use crate::joint::Shares;
+use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::overlap::overlap;
-use crate::kernels::par::Pool;
+use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
 use crate::scene::Scene;
-use crate::stages::{Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
+use crate::stages::{Chance, Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
 
 /// Fewest correspondences that fix a pose.
 const MIN_CORRESPONDENCES: u32 = 3;
@@ -28,9 +30,9 @@ pub struct State<'a> {
     pub(crate) pool: Arc<Pool>,
     pub(crate) rounds_since_settling: u32,
     candidates: Vec<Candidate>,
-    found: Vec<Found>,
-    /// Rounds that had been played when the last instance was found.
-    last_found_at: u32,
+    pub(crate) found: Vec<Found>,
+    /// Rounds that had been played when a hypothesis last passed validation, or an instance was last found.
+    last_passed_at: u32,
     start: Instant,
 }
 
@@ -43,6 +45,7 @@ pub(crate) struct Problem<'a> {
     pub(crate) barred: Vec<bool>,
     pub(crate) claimed: Vec<bool>,
     pub(crate) graph: OnceLock<Graph>,
+    pub(crate) chance: OnceLock<Chance>,
     pub(crate) interrupt: Interrupt,
 }
 
@@ -57,17 +60,41 @@ struct Candidate {
 }
 
 /// An accepted pose and its round.
-#[derive(Debug, Clone, Copy)]
-struct Found {
-    target_from_source: Isometry3<f64>,
-    round: u32,
+#[derive(Debug)]
+pub(crate) struct Found {
+    pub(crate) hypothesis: Hypothesis,
+    pub(crate) round: u32,
+    /// The target rows it explains, with the distance of each.
+    pub(crate) explained: Vec<(u32, f64)>,
+}
+
+impl Found {
+    pub(crate) fn pose(&self) -> &Isometry3<f64> {
+        &self.hypothesis.target_from_source
+    }
 }
 
 impl<'a> Problem<'a> {
     pub(crate) fn new(scene: Scene<'a>, pairs: PointPairs, interrupt: Interrupt) -> Self {
         let (alive, barred) = (Alive::all(&pairs), vec![false; pairs.len()]);
         let claimed = vec![false; scene.target.points.len()];
-        Self { scene, pairs, alive, barred, claimed, graph: OnceLock::new(), interrupt }
+        Self {
+            scene,
+            pairs,
+            alive,
+            barred,
+            claimed,
+            graph: OnceLock::new(),
+            chance: OnceLock::new(),
+            interrupt,
+        }
+    }
+
+    /// Whether two poses of the source can have to do with the same target points.
+    pub(crate) fn are_near(&self, params: &Params, a: &Isometry3<f64>, b: &Isometry3<f64>) -> bool {
+        let source = self.scene.source;
+        let reach = 2.0 * (params.d_op_pr + params.d_op_pr.max(params.t_he_pr)) * self.scene.resolution;
+        (a * source.centre - b * source.centre).norm() < source.extent + reach
     }
 
     /// Takes `ids` out of what is alive; returns how many of them were.
@@ -78,12 +105,16 @@ impl<'a> Problem<'a> {
         self.alive.remove(ids, &self.pairs) as u32
     }
 
-    /// Claims the target points within `d_op` of the accepted model.
-    fn claim(&mut self, params: &Params, target_from_source: &Isometry3<f64>) {
-        let explained = self.scene.explained(params, target_from_source, &self.scene.target.points);
-        for (claimed, explained) in self.claimed.iter_mut().zip(explained) {
-            *claimed |= explained;
+    /// Claims the target points within `d_op` of the accepted model; returns their rows, with the distance of each.
+    fn claim(&mut self, params: &Params, target_from_source: &Isometry3<f64>) -> Vec<(u32, f64)> {
+        let points = &self.scene.target.points;
+        let nearest = self.scene.nearest_source(params.d_op_pr, target_from_source, points);
+        let known = (0_u32..).zip(nearest).filter_map(|(row, by)| Some((row, by?.1)));
+        let explained: Vec<(u32, f64)> = known.collect();
+        for &(row, _) in &explained {
+            self.claimed[row as usize] = true;
         }
+        explained
     }
 
     /// Bars `ids` from leading; returns how many were not barred before.
@@ -92,15 +123,27 @@ impl<'a> Problem<'a> {
     }
 
     pub(crate) fn context<'c>(&'c self, params: &'c Params, round: usize) -> Context<'c> {
+        self.context_of(params, round, &self.alive, &self.claimed)
+    }
+
+    /// A context with other correspondences alive and other scene points claimed.
+    pub(crate) fn context_of<'c>(
+        &'c self,
+        params: &'c Params,
+        round: usize,
+        alive: &'c Alive,
+        claimed: &'c [bool],
+    ) -> Context<'c> {
         Context {
             scene: &self.scene,
             pairs: &self.pairs,
-            alive: &self.alive,
+            alive,
             params,
             round: round as u32,
             barred: &self.barred,
-            claimed: &self.claimed,
+            claimed,
             graph: &self.graph,
+            chance: &self.chance,
             interrupt: &self.interrupt,
         }
     }
@@ -117,14 +160,14 @@ impl<'a> State<'a> {
             rounds_since_settling: 0,
             candidates: Vec::new(),
             found: Vec::new(),
-            last_found_at: 0,
+            last_passed_at: 0,
             start,
         }
     }
 
     /// The poses accepted so far, in the order they were found.
     pub fn poses(&self) -> impl Iterator<Item = Isometry3<f64>> + '_ {
-        self.found.iter().map(|found| found.target_from_source)
+        self.found.iter().map(|found| found.hypothesis.target_from_source)
     }
 
     /// The rounds played so far.
@@ -153,7 +196,7 @@ impl<'a> State<'a> {
         if let Some(threshold) = params.max_instances.filter(|&limit| found >= limit) {
             return ControlFlow::Break(StopReason::MaxInstances { value: found, threshold });
         }
-        let rejections = rounds - self.last_found_at;
+        let rejections = rounds - self.last_passed_at;
         if let Some(threshold) = params.max_rejections.filter(|&limit| rejections >= limit) {
             return ControlFlow::Break(StopReason::MaxRejections { value: rejections, threshold });
         }
@@ -175,10 +218,16 @@ impl<'a> State<'a> {
     ) {
         let index = self.rounds.len() as u32;
         let num_alive = self.problem.alive.ids().len() as u32;
-        let (removed, barred) = match params.removal {
-            Removal::Dense => (dense.ids(), &[][..]),
-            // After an acceptance too: the seeds may all lie outside of the pose that they led to.
-            Removal::Inliers => (&[][..], seeds.ids()),
+        let passed = estimate.hypothesis.filter(|_| verdict.is_some_and(|verdict| verdict.accepted()));
+        let (removed, barred) = match (params.removal, passed) {
+            (Removal::Dense, _) => (dense.ids(), Vec::new()),
+            (Removal::Inliers, None) => (&[][..], seeds.ids().to_vec()),
+            // The seeds too: they may all lie outside of the pose that they led to.
+            (Removal::Inliers, Some(hypothesis)) => {
+                let context = self.problem.context(params, index as usize);
+                let inliers = context.inliers(&hypothesis.target_from_source, 2.0 * params.t_he_pr);
+                (&[][..], [seeds.ids(), &inliers].concat())
+            }
         };
         self.rounds.push(Round {
             index,
@@ -190,12 +239,31 @@ impl<'a> State<'a> {
             hypothesis_score: estimate.hypothesis.map(|h| h.score),
             verdict,
             num_removed: self.problem.remove(removed),
-            num_barred: self.problem.bar(barred),
+            num_barred: self.problem.bar(&barred),
         });
         self.rounds_since_settling += 1;
         if let (Some(hypothesis), Some(verdict)) = (estimate.hypothesis, verdict.filter(Verdict::accepted)) {
             let measured_at = self.num_found();
-            self.candidates.push(Candidate { hypothesis, value: verdict.value, round: index, measured_at });
+            self.enter(params, Candidate { hypothesis, value: verdict.value, round: index, measured_at });
+        }
+    }
+
+    /// Enters a candidate for the contest. Of two that are the same pose the better one stays; only one that is
+    /// new counts as a success.
+    fn enter(&mut self, params: &Params, candidate: Candidate) {
+        let scene = &self.problem.scene;
+        let same = 2.0 * params.t_he_pr * scene.resolution;
+        let is_same = |other: &&mut Candidate| {
+            let [a, b] = [&candidate, &**other].map(|c| &c.hypothesis.target_from_source);
+            scene.source.displacement(a, b) < same
+        };
+        match self.candidates.iter_mut().find(is_same) {
+            Some(other) if other.value < candidate.value => *other = candidate,
+            Some(_) => {}
+            None => {
+                self.last_passed_at = candidate.round + 1;
+                self.candidates.push(candidate);
+            }
         }
     }
 
@@ -207,13 +275,15 @@ impl<'a> State<'a> {
         }
     }
 
-    /// Validates again the candidates that were measured before the last instance claimed its points; drops
+    /// Validates again the candidates near which an instance has claimed points since they were measured; drops
     /// those that fail.
     pub(crate) fn measure_candidates(&mut self, params: &Params, hv: &dyn Validate) {
         let now = self.num_found();
         let mut candidates = std::mem::take(&mut self.candidates);
         candidates.retain_mut(|candidate| {
-            if candidate.measured_at < now {
+            let since = &self.found[candidate.measured_at as usize..];
+            let pose = &candidate.hypothesis.target_from_source;
+            if since.iter().any(|found| self.problem.are_near(params, pose, found.pose())) {
                 let context = self.problem.context(params, candidate.round as usize);
                 let verdict = hv.validate(&context, &candidate.hypothesis);
                 (candidate.value, candidate.measured_at) = (verdict.value, now);
@@ -241,16 +311,29 @@ impl<'a> State<'a> {
                 last.num_removed += num_removed;
             }
         }
-        self.problem.claim(params, &target_from_source);
-        self.found.push(Found { target_from_source, round });
-        self.last_found_at = self.rounds.len() as u32;
+        let explained = self.problem.claim(params, &target_from_source);
+        self.found.push(Found { hypothesis, round, explained });
+        self.last_passed_at = self.rounds.len() as u32;
         Some(value)
     }
 
     /// The result: poses measured and ranked, correspondences labelled.
     pub(crate) fn into_registration(mut self, params: &Params, stop_reason: StopReason) -> Registration {
-        let mut measured: Vec<(Pose, Vec<f64>)> =
-            self.found.iter().map(|found| measure(&self.problem, params, found)).collect();
+        let shares = params.joint_check.then(|| Shares::new(&self.problem, &self.found));
+        let (everything, unclaimed) =
+            (Alive::all(&self.problem.pairs), vec![false; self.problem.claimed.len()]);
+        let mut measured: Vec<(Pose, Vec<f64>)> = par::map(self.found.len(), 1, |at| {
+            let found = &self.found[at];
+            let support = match &shares {
+                Some(shares) => {
+                    shares.alone(&self.problem, params, at, |own| own.support(found.pose(), true))
+                }
+                None => {
+                    self.problem.context_of(params, 0, &everything, &unclaimed).support(found.pose(), false)
+                }
+            };
+            measure(&self.problem, params, found, &support)
+        });
         // Stable: equals stay in the order in which they were found.
         measured.sort_by(|(a, _), (b, _)| b.score.total_cmp(&a.score));
         let labels = labels(&measured, self.problem.pairs.len());
@@ -267,8 +350,8 @@ impl<'a> State<'a> {
 }
 
 /// A pose with its quality measures, and the squared residual of each of its inliers.
-fn measure(problem: &Problem<'_>, params: &Params, found: &Found) -> (Pose, Vec<f64>) {
-    let pose = found.target_from_source;
+fn measure(problem: &Problem<'_>, params: &Params, found: &Found, support: &Support) -> (Pose, Vec<f64>) {
+    let pose = *found.pose();
     let (scene, pairs) = (&problem.scene, &problem.pairs);
     let t_he = params.t_he_pr * scene.resolution;
     let (inliers, residuals_sq): (Vec<u32>, Vec<f64>) = pairs
@@ -281,8 +364,11 @@ fn measure(problem: &Problem<'_>, params: &Params, found: &Found) -> (Pose, Vec<
     let overlap = overlap(&scene.places(params, &pose));
     let pose = Pose {
         target_from_source: pose,
-        score: overlap,
+        score: support.score(),
         overlap,
+        closeness: support.closeness(),
+        back_fit: support.back_fit,
+        evidence: support.evidence(),
         inlier_rmse: mean_sq.sqrt(),
         inliers,
         round: found.round,

@@ -190,10 +190,11 @@ fn nothing_is_lost_when_the_rounds_run_dry() {
     assert_eq!(result.stop_reason, StopReason::FewCorrespondences { value: 1, threshold: 3 });
     assert_eq!((result.rounds.len(), sorted_places(&result)), (3, ALL.to_vec()));
 
-    // Instances that were only waiting are no rejections: the count begins anew once they are found.
+    // What passes is no rejection, and what was only waiting is none either: the count begins anew after the third
+    // round, and once more when the instances are found after the sixth.
     let result = register(&planned(WAITING, Params { max_rejections: Some(3), ..endless() }));
     assert_eq!(result.stop_reason, StopReason::MaxRejections { value: 3, threshold: 3 });
-    assert_eq!((result.rounds.len(), sorted_places(&result)), (6, ALL.to_vec()));
+    assert_eq!((result.rounds.len(), sorted_places(&result)), (9, ALL.to_vec()));
 
     // The same five seeds for ever: every round after the first removes nothing.
     let stalled = planned(WAITING, endless())
@@ -289,9 +290,43 @@ fn an_instance_uses_up_its_inliers_when_its_contest_ends() {
         Ranked::new(free.take(5).map(|&id| (id, 1.0)).collect())
     }));
     let result = register(&registrar);
-    let booked: Vec<_> = result.rounds.iter().map(|round| (round.num_removed, round.num_alive)).collect();
-    // Ten correspondences end on the points of each instance: two, then one, at the end of their contests.
-    assert_eq!(booked, [(0, 100), (20, 100), (0, 80), (10, 80)]);
+    let booked: Vec<_> =
+        result.rounds.iter().map(|round| (round.num_removed, round.num_barred, round.num_alive)).collect();
+    // Ten correspondences end on the points of each instance: two, then one, at the end of their contests. From their
+    // round on they may not lead, nor may the five seeds of a round, which in the first are among the ten.
+    assert_eq!(booked, [(0, 10, 100), (20, 15, 100), (0, 15, 80), (10, 5, 80)]);
+}
+
+#[test]
+fn of_two_candidates_that_are_the_same_pose_the_better_one_stays() {
+    // Poses below 2 t_he apart are the same. 0 and 10 share no scene point, so that both would hold.
+    let plan: Plan = &[(0, 0.9), (10, 1.0), (50, 0.8), (40, 0.7)];
+    let found = |t_he_pr| {
+        let result = register(&planned(plan, Params { t_he_pr, max_rounds: Some(4), ..contest(4) }));
+        assert!(result.rounds.iter().all(Round::accepted));
+        let mut found: Vec<_> =
+            result.poses.iter().map(|p| (p.target_from_source.translation.x as usize, p.round)).collect();
+        found.sort_unstable();
+        found
+    };
+    assert_eq!(found(4.99), [(0, 0), (10, 1), (40, 3), (50, 2)]);
+    assert_eq!(found(5.01), [(10, 1), (50, 2)]);
+}
+
+#[test]
+fn the_same_pose_again_is_no_success() {
+    // The last round that brings something new is the second; the better pose of the third is still the same.
+    let plan: Plan = &[(0, 0.8), (50, 0.8), (1, 1.0), (51, 0.7)];
+    let rounds = |t_he_pr| {
+        let params = Params { t_he_pr, max_rejections: Some(5), ..endless() };
+        let result = register(&planned(plan, params));
+        assert_eq!(result.stop_reason, StopReason::MaxRejections { value: 5, threshold: 5 });
+        (result.rounds.len(), sorted_places(&result))
+    };
+    // Dry after five rounds more, settled, and dry for good after another five.
+    assert_eq!(rounds(1.0), (2 + 5 + 5, vec![1, 50]));
+    // Else all four would be entered, although the other two then fall to what is claimed.
+    assert_eq!(rounds(0.4), (4 + 5 + 5, vec![1, 50]));
 }
 
 // ------------------------------------------------------------------------------------------------ single view

@@ -23,12 +23,18 @@ use serde_json::{Value, json};
 /// full where they matter, so that new defaults do not change the files.
 fn paper(n_vot: u32) -> Value {
     json!({
+        "delta_r_pr": 10.0,
         "t_he_pr": 1.0,
         "d_op_pr": 0.5,
+        "min_normal_cos": null,
+        "t_s": 5,
         "scs": { "variant": "gtm", "n_downsample": 1024, "n_gtm": 20, "payoff": "gaussian" },
         "ce": { "variant": "voting", "n_vot": n_vot },
         "te": { "variant": "gsac", "n_gsac": 100, "min_height_pr": 2.0 },
-        "hv": { "variant": "overlap", "t_overlap": 0.85 },
+        "hv": { "variant": "overlap", "t_overlap": 0.85, "exclusive": false },
+        "refine": "none",
+        "n_contest": 1,
+        "joint_check": false,
         "removal": "dense",
         "max_rejections": null
     })
@@ -91,6 +97,7 @@ fn labels_of(result: &Registration) -> Vec<i64> {
 fn expected_of(result: &Registration) -> Value {
     json!({
         "poses": result.poses.iter().map(|p| rows_of(&p.target_from_source.to_homogeneous())).collect::<Vec<_>>(),
+        "scores": result.poses.iter().map(|pose| pose.score).collect::<Vec<_>>(),
         "labels": labels_of(result),
         "stop_reason": serde_json::to_value(result.stop_reason).unwrap()["name"],
         "num_rounds": result.rounds.len(),
@@ -153,6 +160,11 @@ fn check_file(file: &Value) {
     for (pose, expected) in result.poses.iter().zip(&poses) {
         assert!(is_close(&pose.target_from_source.to_homogeneous(), expected, 1e-6), "{name}");
     }
+    let scores: Vec<f64> = read(expected, "scores");
+    assert!(
+        result.poses.iter().zip(&scores).all(|(pose, score)| (pose.score - score).abs() < 1e-6),
+        "{name}"
+    );
     // Right, and not only the same: every instance is found, where its points go, and nothing else is.
     let truth = matrices(file, "truth");
     let source: Vec<[f64; 3]> = read(file, "src");

@@ -19,35 +19,67 @@ const UNDECIDED: f64 = 1e-4;
 /// Source and target normals of correspondences.
 type Normals = (Vec<Vector3<f64>>, Vec<Vector3<f64>>);
 
+/// Normals whose signs mean something, and normals whose signs do not.
+const ORIENTED: bool = true;
+const UNORIENTED: bool = false;
+
 fn columns(pairs: &[Pair], unit: f64) -> Columns {
     let (source, target): (Vec<_>, Vec<_>) = pairs.iter().copied().unzip();
     Columns::new(&source, &target, unit)
 }
 
 /// The graph of `pairs` as the kernel has it, columns being in multiples of `unit`.
-fn graph_of(pairs: &[Pair], normals: Option<&Normals>, test: &naive::EdgeTest, unit: f64) -> Graph {
+fn graph_of(pairs: &[Pair], normals: Option<(&Normals, bool)>, test: &naive::EdgeTest, unit: f64) -> Graph {
+    graph_with(pairs, normals, test, unit, true)
+}
+
+fn graph_with(
+    pairs: &[Pair],
+    normals: Option<(&Normals, bool)>,
+    test: &naive::EdgeTest,
+    unit: f64,
+    second_order: bool,
+) -> Graph {
     let cast = |normals: &[Vector3<f64>]| normals.iter().map(|n| n.cast::<f32>()).collect();
-    let normals = normals.map(|(p, q)| PairNormals { source: cast(p), target: cast(q) });
+    let normals =
+        normals.map(|((p, q), oriented)| PairNormals { source: cast(p), target: cast(q), oriented });
     let test = EdgeTest {
         tau: (test.tau / unit) as f32,
         min_length: (test.min_length / unit) as f32,
         max_length: (test.max_length / unit) as f32,
         normal_tolerance: test.normal_tolerance as f32,
+        second_order,
     };
     Graph::new(&columns(pairs, unit), normals.as_ref(), &test, || false)
 }
 
 /// By how much the angles of i and j pass, and how exactly `f32` knows it: the shorter the line between two
 /// points, the less its direction is worth.
-fn angle_margin(pairs: &[Pair], (n, m): &Normals, i: usize, j: usize, tolerance: f64) -> (f64, f64) {
+fn angle_margin(
+    pairs: &[Pair],
+    ((n, m), oriented): (&Normals, bool),
+    (i, j): (usize, usize),
+    tolerance: f64,
+) -> (f64, f64) {
     let ((p, q), (p2, q2)) = (&pairs[i], &pairs[j]);
-    let (here, there) = (naive::angles((p, &n[i]), (p2, &n[j])), naive::angles((q, &m[i]), (q2, &m[j])));
+    let sides = [naive::angles((p, &n[i]), (p2, &n[j])), naive::angles((q, &m[i]), (q2, &m[j]))];
+    let [here, there] = sides.map(|cos| if oriented { cos } else { cos.map(f64::abs) });
     let worst = here.iter().zip(there).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     (tolerance - worst, UNDECIDED + 1e-5 / (p - p2).norm().min((q - q2).norm()))
 }
 
+/// For each correspondence its neighbours, the bits of their weights, and those of its support.
+fn bits(graph: &Graph) -> Vec<(Vec<u32>, Vec<u32>, u32)> {
+    let row = |i| {
+        let (neighbors, weights) = graph.edges(i);
+        let weights = weights.iter().map(|w| w.to_bits()).collect();
+        (neighbors.to_vec(), weights, graph.support(i).to_bits())
+    };
+    (0..graph.len() as u32).map(row).collect()
+}
+
 /// Holds `graph` against the definition, on `pairs` or on what a rigid motion made of them.
-fn check_graph(graph: &Graph, pairs: &[Pair], normals: Option<&Normals>, test: &naive::EdgeTest) {
+fn check_graph(graph: &Graph, pairs: &[Pair], normals: Option<(&Normals, bool)>, test: &naive::EdgeTest) {
     let n = pairs.len();
     assert_eq!((graph.len(), graph.is_empty()), (n, n == 0));
     let rows: Vec<HashSet<u32>> = (0..n as u32).map(|i| graph.edges(i).0.iter().copied().collect()).collect();
@@ -65,7 +97,7 @@ fn check_graph(graph: &Graph, pairs: &[Pair], normals: Option<&Normals>, test: &
             }
             let margin = naive::edge_margin(a, b, test);
             let (turn, doubt) = normals.map_or((f64::INFINITY, 0.0), |normals| {
-                angle_margin(pairs, normals, i, j, test.normal_tolerance)
+                angle_margin(pairs, normals, (i, j), test.normal_tolerance)
             });
             if margin > UNDECIDED && turn > doubt {
                 assert!(joined, "{i} {j} {margin} {turn}");
@@ -128,7 +160,54 @@ proptest! {
 
     #[test]
     fn graph_with_normals_is_its_twin((pairs, normals) in oriented(0..50), test in tests()) {
-        check_graph(&graph_of(&pairs, Some(&normals), &test, 1.0), &pairs, Some(&normals), &test);
+        for oriented in [ORIENTED, UNORIENTED] {
+            let normals = Some((&normals, oriented));
+            check_graph(&graph_of(&pairs, normals, &test, 1.0), &pairs, normals, &test);
+        }
+    }
+
+    #[test]
+    fn the_signs_of_unoriented_normals_mean_nothing(
+        (pairs, (n, m)) in oriented(0..50), test in tests(), one in prop::collection::vec(any::<bool>(), 50),
+        other in prop::collection::vec(any::<bool>(), 50), pose in rigid_motions(1.0), min_cos in 0.0..1.0,
+    ) {
+        let flipped = |normals: &[Vector3<f64>], flips: &[bool]| -> Vec<_> {
+            normals.iter().zip(flips).map(|(n, &flip)| if flip { -n } else { *n }).collect()
+        };
+        let (here, there) = ((n.clone(), m.clone()), (flipped(&n, &one), flipped(&m, &other)));
+        let ask = |normals: &Normals| bits(&graph_of(&pairs, Some((normals, UNORIENTED)), &test, 1.0));
+        prop_assert_eq!(ask(&here), ask(&there));
+
+        let cast = |normals: &[Vector3<f64>]| normals.iter().map(|n| n.cast()).collect();
+        let agreeing = |(n, m): &Normals, oriented| -> Vec<bool> {
+            let normals = PairNormals { source: cast(n), target: cast(m), oriented };
+            (0..n.len() as u32).map(|i| normals.agree(i, &pose, min_cos)).collect()
+        };
+        prop_assert_eq!(agreeing(&here, UNORIENTED), agreeing(&there, UNORIENTED));
+        // Where signs count, what agrees one way does not the other.
+        let either = agreeing(&here, UNORIENTED);
+        let turned = (n.iter().map(|n| -n).collect(), m);
+        for ((one, other), either) in agreeing(&here, ORIENTED).into_iter().zip(agreeing(&turned, ORIENTED)).zip(either) {
+            prop_assert_eq!(one ^ other, either);
+        }
+    }
+
+    #[test]
+    fn without_second_order_an_edge_weighs_its_own_rigidity(
+        (pairs, normals) in oriented(0..50), test in tests(), with_normals: bool,
+    ) {
+        let normals = with_normals.then_some((&normals, ORIENTED));
+        let second = graph_of(&pairs, normals, &test, 1.0);
+        let first = graph_with(&pairs, normals, &test, 1.0, false);
+        for i in 0..pairs.len() {
+            let (neighbors, weights) = first.edges(i as u32);
+            prop_assert_eq!(neighbors, second.edges(i as u32).0);
+            for (&j, &w) in neighbors.iter().zip(weights) {
+                let weight = naive::edge_weight(&pairs[i], &pairs[j as usize], test.tau);
+                prop_assert!((f64::from(w) - weight).abs() <= UNDECIDED / test.tau + 1e-6, "{w} {weight}");
+            }
+        }
+        check_support(&first, &HashSet::new());
     }
 
     #[test]
@@ -138,7 +217,10 @@ proptest! {
     ) {
         let moved: Vec<Pair> = pairs.iter().map(|(p, q)| (one * p, other * q)).collect();
         let turned = (n.iter().map(|n| one * n).collect(), m.iter().map(|m| other * m).collect());
-        check_graph(&graph_of(&moved, Some(&turned), &test, 1.0), &pairs, Some(&(n, m)), &test);
+        for oriented in [ORIENTED, UNORIENTED] {
+            let graph = graph_of(&moved, Some((&turned, oriented)), &test, 1.0);
+            check_graph(&graph, &pairs, Some((&(n.clone(), m.clone()), oriented)), &test);
+        }
         check_graph(&graph_of(&moved, None, &test, 1.0), &pairs, None, &test);
     }
 
@@ -186,14 +268,6 @@ fn graph_has_the_same_bits_for_any_number_of_threads() {
     let pairs = scene_pairs();
     let all = || {
         let mut graph = graph_of(&pairs, None, &SCENE_TEST, 0.2);
-        let bits = |graph: &Graph| -> Vec<(Vec<u32>, Vec<u32>, u32)> {
-            let row = |i| {
-                let (neighbors, weights) = graph.edges(i);
-                let weights = weights.iter().map(|w| w.to_bits()).collect();
-                (neighbors.to_vec(), weights, graph.support(i).to_bits())
-            };
-            (0..graph.len() as u32).map(row).collect()
-        };
         let before = bits(&graph);
         graph.remove(&(0..pairs.len() as u32).step_by(3).collect::<Vec<_>>());
         (before, bits(&graph))
@@ -207,7 +281,8 @@ fn graph_has_the_same_bits_for_any_number_of_threads() {
 
 #[test]
 fn an_interrupted_graph_is_empty_but_whole() {
-    let test = EdgeTest { tau: 1.0, min_length: 1.0, max_length: 20.0, normal_tolerance: 0.3 };
+    let test =
+        EdgeTest { tau: 1.0, min_length: 1.0, max_length: 20.0, normal_tolerance: 0.3, second_order: true };
     let graph = Graph::new(&columns(&scene_pairs(), 0.2), None, &test, || true);
     assert_eq!(graph.len(), 400);
     assert!((0..400).all(|i| graph.edges(i).0.is_empty() && graph.support(i) == 0.0));

@@ -2,16 +2,19 @@
 //! who may claim a scene point.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::float_cmp, reason = "tests may panic")]
 
+mod common;
+
+use common::Mock;
 use ibi_core::kernels::icp::icp;
 use ibi_core::kernels::neighbors::Neighbors;
 use ibi_core::kernels::overlap::{Contact, Place, Surface, overlap, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
-use ibi_core::stages::hv::Overlap;
+use ibi_core::stages::hv::{Hv, Overlap};
 use ibi_core::stages::scs::LocalGtm;
 use ibi_core::stages::te::Irls;
-use ibi_core::stages::{Context, Estimate, EstimatePose, Hypothesis, Ranked};
-use ibi_core::{Cloud, Correspondences, Params, Refine, Registrar, Removal};
+use ibi_core::stages::{Context, Estimate, EstimatePose, Hypothesis, Ranked, Verdict};
+use ibi_core::{Cloud, Correspondences, Params, Pose, Refine, Registrar, Removal};
 use ibi_testkit::Rng;
 use ibi_testkit::naive;
 use ibi_testkit::scenes::asymmetric_model;
@@ -52,7 +55,7 @@ fn clouds(count: std::ops::Range<usize>) -> impl Strategy<Value = Oriented> {
 }
 
 fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact {
-    Contact { distance, min_normal_cos: 0.5, viewpoint }
+    Contact { distance, min_normal_cos: 0.5, oriented: true, viewpoint }
 }
 
 fn viewpoints() -> impl Strategy<Value = Option<Point3<f64>>> {
@@ -326,14 +329,21 @@ fn icp_gives_the_same_bits_for_any_number_of_threads() {
 
 // -------------------------------------------------------------------------------------- claimed scene points
 
+/// A model that half a turn about z maps onto itself: point i onto point i + half of them.
+fn half_turn_model(half: usize) -> Vec<Point3<f64>> {
+    let once: Vec<_> = asymmetric_model(half).iter().map(|p| p + Vector3::new(0.4, 0.3, 0.0)).collect();
+    let again = once.iter().map(|p| Point3::new(-p.x, -p.y, p.z));
+    once.iter().copied().chain(again).collect()
+}
+
 #[test]
-fn coincident_instances_are_found_once_if_scene_points_are_exclusive() {
-    let source = asymmetric_model(200);
+fn a_symmetric_instance_is_found_once_if_scene_points_are_exclusive() {
+    let source = half_turn_model(100);
     let pose = Rng::new(4).pose_at(Vector3::new(4.0, 1.0, -2.0));
     let target: Vec<_> = source.iter().map(|p| pose * p).collect();
-    // Every correspondence is there twice, so that seeds enough remain for the instance to come again; in a
-    // contest nothing is removed before it ends.
-    let rows: Vec<[usize; 2]> = (0..400).map(|row| [row % 200, row % 200]).collect();
+    // Half of the correspondences speak for the pose, half for it turned; in a contest nothing is removed before
+    // it ends.
+    let rows: Vec<[usize; 2]> = (0..400).map(|row| [(row + 100 * (row / 200)) % 200, row % 200]).collect();
     let found = |exclusive| {
         let params = Params {
             t_he_pr: 2.0,
@@ -350,42 +360,105 @@ fn coincident_instances_are_found_once_if_scene_points_are_exclusive() {
         registrar.register(&Cloud::new(&target), &Correspondences::from_rows(rows.clone())).unwrap()
     };
     let (once, more) = (found(true), found(false));
-    assert_eq!(once.poses.len(), 1);
-    assert!(more.poses.len() >= 2, "{}", more.poses.len());
-    for found in once.poses.iter().chain(&more.poses) {
-        assert!(distance(&source, &found.target_from_source, &pose) < 1e-6);
+    assert_eq!((once.poses.len(), more.poses.len()), (1, 2));
+    let turned = pose * Isometry3::rotation(Vector3::z() * std::f64::consts::PI);
+    let off = |found: &Pose, truth| distance(&source, &found.target_from_source, truth);
+    assert!(once.poses.iter().all(|found| off(found, &pose).min(off(found, &turned)) < 1e-6));
+    for truth in [&pose, &turned] {
+        assert_eq!(more.poses.iter().filter(|found| off(found, truth) < 1e-6).count(), 1);
     }
     // Both runs entered the same hypotheses for their first contest.
     assert_eq!(once.rounds[..2].iter().filter(|round| round.accepted()).count(), 2);
 }
 
-// ------------------------------------------------------------------------------- support after the refinement
+// --------------------------------------------------------------------------- the refined pose and the unrefined
 
 /// A transformation estimation that always answers with one pose.
-struct Fixed(Isometry3<f64>);
+fn always(pose: Isometry3<f64>) -> impl EstimatePose + 'static {
+    let hypothesis = Hypothesis { target_from_source: pose, score: 1.0 };
+    Mock(move |_: &Context<'_>, _: &Ranked| Estimate {
+        hypothesis: Some(hypothesis),
+        num_samples: 1,
+        num_degenerate: 0,
+    })
+}
 
-impl EstimatePose for Fixed {
-    fn estimate_pose(&self, _: &Context<'_>, _: &Ranked) -> Estimate {
-        let hypothesis = Hypothesis { target_from_source: self.0, score: 1.0 };
-        Estimate { hypothesis: Some(hypothesis), num_samples: 1, num_degenerate: 0 }
+/// What one round makes of the hypothesis `start` on a model that is its own target, where the correspondences
+/// agree with a pose of their own: the verdict, and the pose if it was accepted.
+fn judged(
+    start: Isometry3<f64>,
+    agreeing_with: &Isometry3<f64>,
+    params: Params,
+) -> (Verdict, Option<Isometry3<f64>>) {
+    let model = Oriented::model(200);
+    let pairs = model.points.iter().map(|p| [*p, agreeing_with * p]).collect();
+    let cloud = Cloud::new(&model.points).with_normals(model.normals);
+    let params = Params { max_rounds: Some(1), ..params };
+    let registrar = Registrar::new(&cloud).unwrap().params(params).num_threads(1).with_te(always(start));
+    let result = registrar.register(&cloud, &Correspondences::from_points(pairs)).unwrap();
+    (result.rounds[0].verdict.unwrap(), result.poses.first().map(|pose| pose.target_from_source))
+}
+
+fn with_each_validation(params: &Params) -> impl Iterator<Item = Params> {
+    Hv::all().into_iter().map(move |hv| Params { hv, ..params.clone() })
+}
+
+#[test]
+fn a_refined_pose_must_keep_the_agreement_of_its_correspondences() {
+    let spacing = naive::mean_spacing(&asymmetric_model(200));
+    let here = Isometry3::identity();
+    let off = Isometry3::translation(0.5 * spacing, 0.0, 0.0);
+    for params in with_each_validation(&Params { t_he_pr: 0.3, ..Params::default() }) {
+        let pose = |agreeing_with, refine| {
+            judged(off, agreeing_with, Params { refine, ..params.clone() }).1.expect(params.hv.name())
+        };
+        // Carried to where the clouds fit: good if the correspondences say so too, also where the measure cannot
+        // tell the two poses apart.
+        let refined = pose(&here, Refine::Icp);
+        assert!(refined.translation.vector.norm() < 0.01 * spacing, "{} {refined}", params.hv.name());
+        // Carried away from all of them: what was there before stays.
+        assert_eq!(pose(&off, Refine::Icp), off, "{}", params.hv.name());
+        assert_eq!(pose(&off, Refine::None), off);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(32))]
+
+    #[test]
+    fn refinement_never_lowers_the_verdict(
+        shift in prop::array::uniform3(-0.3..0.3), turn in prop::array::uniform3(-0.3..0.3),
+        there in prop::array::uniform3(-0.2..0.2), oriented: bool, t_he_pr in 0.3..5.0,
+    ) {
+        let start = Isometry3::new(Vector3::from(shift), Vector3::from(turn));
+        let agreeing_with = Isometry3::translation(there[0], there[1], there[2]);
+        let params = Params { t_he_pr, oriented_normals: oriented, ..Params::default() };
+        for params in with_each_validation(&params) {
+            let (refined, _) = judged(start, &agreeing_with, params.clone());
+            let (plain, _) = judged(start, &agreeing_with, Params { refine: Refine::None, ..params });
+            prop_assert!(refined.value >= plain.value, "{refined:?} {plain:?}");
+            prop_assert_eq!(refined.threshold, plain.threshold);
+        }
     }
 }
 
 #[test]
-fn a_pose_that_no_correspondence_agrees_with_is_dropped_although_the_clouds_fit() {
+fn a_pose_that_no_correspondence_agrees_with_is_no_instance_although_the_clouds_fit() {
     let source = asymmetric_model(200);
     let (near, far) = (Isometry3::translation(4.0, 0.0, 0.0), Isometry3::translation(-4.0, 0.0, 0.0));
     let target: Vec<_> = [near, far].iter().flat_map(|pose| source.iter().map(move |p| pose * p)).collect();
     // Only the first copy has correspondences.
     let correspondences = Correspondences::from_rows((0..200).map(|row| [row, row]).collect());
-    let found = |pose, refine| {
-        let params = Params { refine, max_rounds: Some(1), ..Params::default() };
-        let registrar = Registrar::new(&Cloud::new(&source)).unwrap().params(params).with_te(Fixed(pose));
-        registrar.register(&Cloud::new(&target), &correspondences).unwrap()
+    let found = |pose, params: Params| {
+        let params = Params { max_rounds: Some(1), ..params };
+        let registrar = Registrar::new(&Cloud::new(&source)).unwrap().params(params).with_te(always(pose));
+        registrar.register(&Cloud::new(&target), &correspondences).unwrap().poses.len()
     };
-    assert_eq!(found(near, Refine::Icp).poses.len(), 1);
-    let dropped = found(far, Refine::Icp);
-    assert!(dropped.poses.is_empty() && dropped.rounds[0].verdict.is_none());
-    // Without refinement there is nothing to be carried away by, and overlap alone decides, as in the paper.
-    assert_eq!(found(far, Refine::None).poses.len(), 1);
+    for refine in [Refine::None, Refine::Icp] {
+        let evidence = Params { refine, ..Params::default() };
+        assert_eq!((found(near, evidence.clone()), found(far, evidence.clone())), (1, 0));
+        // Overlap asks the clouds alone, as in the paper.
+        let overlap = Params { hv: Overlap::default().into(), joint_check: false, ..evidence };
+        assert_eq!((found(near, overlap.clone()), found(far, overlap)), (1, 1));
+    }
 }

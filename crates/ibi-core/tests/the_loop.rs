@@ -375,7 +375,10 @@ fn poses_are_ranked_by_score_and_equals_keep_their_order() {
         .collect();
     let expected = [(0.0, 1.0, 2), (10.0, 0.9, 1), (-10.0, 0.9, 3), (20.0, 0.8, 4), (30.0, 0.7, 0)];
     assert_eq!(ranked, expected);
-    assert!(result.poses.iter().all(|pose| pose.score.to_bits() == pose.overlap.to_bits()));
+    let scores: Vec<f64> = result.poses.iter().map(|pose| pose.score).collect();
+    assert_eq!(scores[1].to_bits(), scores[2].to_bits());
+    assert!(scores.iter().all(|score| (0.0..=1.0).contains(score)));
+    assert!([(0, 1), (2, 3), (3, 4)].iter().all(|&(better, worse)| scores[better] > scores[worse]));
 }
 
 #[test]
@@ -387,13 +390,13 @@ fn labels_go_to_the_closest_pose_and_of_equals_to_the_better_ranked() {
         .with_te(Mock(move |context: &Context<'_>, _: &Ranked| shifted(shifts[context.round as usize])));
     let result = register(&registrar);
     let rounds: Vec<u32> = result.poses.iter().map(|pose| pose.round).collect();
-    // By overlap: 1 and 2 cover everything, 3 all but five points, 0 nothing.
-    assert_eq!(rounds, [1, 2, 3, 0]);
-    assert!(result.labels.iter().all(|&label| label == Some(0)));
+    // By score: 3 puts all but five points exactly onto others, 1 and 2 all of them near, 0 none.
+    assert_eq!(rounds, [3, 1, 2, 0]);
+    assert!(result.labels.iter().all(|&label| label == Some(1)));
     let num_inliers: Vec<usize> = result.poses.iter().map(|pose| pose.inliers.len()).collect();
-    assert_eq!(num_inliers, [M, M, 0, M]);
+    assert_eq!(num_inliers, [0, M, M, M]);
     let rmse: Vec<f64> = result.poses.iter().map(|pose| pose.inlier_rmse).collect();
-    assert_eq!(rmse, [0.25, 0.25, 0.0, 0.5]);
+    assert_eq!(rmse, [0.0, 0.25, 0.25, 0.5]);
 }
 
 #[test]

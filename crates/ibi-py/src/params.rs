@@ -52,7 +52,14 @@ fn check_params(json: &str) -> PyResult<String> {
 
 #[pyfunction]
 fn params_to_toml(json: &str) -> PyResult<String> {
-    toml::to_string(&parse(json)?).map_err(invalid)
+    let mut plain = serde_json::to_value(parse(json)?).map_err(invalid)?;
+    // TOML has no null, and what it leaves out takes its default, which need not be none.
+    for value in plain.as_object_mut().into_iter().flat_map(|params| params.values_mut()) {
+        if value.is_null() {
+            *value = "none".into();
+        }
+    }
+    toml::to_string(&plain).map_err(invalid)
 }
 
 #[pyfunction]

@@ -171,6 +171,9 @@ fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyResult<Bound<
     result.set_item("target_from_source", matrices)?;
     result.set_item("score", column(|p| p.score))?;
     result.set_item("overlap", column(|p| p.overlap))?;
+    result.set_item("closeness", column(|p| p.closeness))?;
+    result.set_item("back_fit", column(|p| p.back_fit))?;
+    result.set_item("evidence", column(|p| p.evidence))?;
     result.set_item("inlier_rmse", column(|p| p.inlier_rmse))?;
     result.set_item("inliers", inliers)?;
     result.set_item("round", PyArray1::from_iter(py, poses.iter().map(|p| i64::from(p.round))))?;

@@ -125,6 +125,12 @@ pub fn nearest_dist_sq(points: &[Point3<f64>], query: &Point3<f64>) -> f64 {
     points.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min)
 }
 
+/// Rows of the points within `distance` of the query, ascending.
+#[must_use]
+pub fn within(points: &[Point3<f64>], query: &Point3<f64>, distance: f64) -> Vec<u32> {
+    (0..points.len() as u32).filter(|&row| (points[row as usize] - query).norm() <= distance).collect()
+}
+
 /// Mean distance of a point to the nearest other one; 0 for fewer than two.
 #[must_use]
 pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
@@ -143,6 +149,55 @@ pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
 pub fn overlap(source: &[Point3<f64>], target: &[Point3<f64>], pose: &Isometry3<f64>, d_op: f64) -> f64 {
     let close = |p: &&Point3<f64>| target.iter().any(|q| (pose * **p - q).norm() <= d_op);
     source.iter().filter(close).count() as f64 / source.len() as f64
+}
+
+/// Points, and their normals where those count.
+pub type Surface<'a> = (&'a [Point3<f64>], Option<&'a [Vector3<f64>]>);
+
+/// Least and largest mean over the moved source points of max(0, 1 - d / reach), d being the distance to the nearest
+/// target point, if that is not `claimed` and the cosine of the normals (or its magnitude, if they are not
+/// `oriented`) is at least `min_cos`. Two values, because which of equally near points it is nobody says.
+#[must_use]
+pub fn fit(
+    (source, normals): Surface<'_>,
+    (target, target_normals): Surface<'_>,
+    claimed: &[bool],
+    pose: &Isometry3<f64>,
+    reach: f64,
+    (min_cos, oriented): (f64, bool),
+) -> (f64, f64) {
+    let (mut least, mut most) = (0.0, 0.0);
+    for (i, point) in source.iter().enumerate() {
+        let moved = pose * point;
+        let nearest = nearest_dist_sq(target, &moved).sqrt();
+        let counts = |row: usize| {
+            let cos = normals.zip(target_normals).map_or(1.0, |(n, m)| (pose * n[i]).dot(&m[row]));
+            !claimed[row] && if oriented { cos } else { cos.abs() } >= min_cos
+        };
+        let ties = within(target, &moved, nearest + 1e-9);
+        let near = (1.0 - nearest / reach).max(0.0);
+        least += if ties.iter().all(|&row| counts(row as usize)) { near } else { 0.0 };
+        most += if ties.iter().any(|&row| counts(row as usize)) { near } else { 0.0 };
+    }
+    let n = source.len().max(1) as f64;
+    (least / n, most / n)
+}
+
+/// -log10 P[Bin(n, p) >= k], summed up term by term.
+#[must_use]
+pub fn binomial_surprise(n: u32, k: u32, p: f64) -> f64 {
+    let mut ln_choose = 0.0; // of n over i
+    let mut terms = Vec::new();
+    for i in 0..=n {
+        let (i_f, n_f) = (f64::from(i), f64::from(n));
+        if i >= k {
+            terms.push(ln_choose + i_f * p.ln() + (n_f - i_f) * (-p).ln_1p());
+        }
+        ln_choose += ((n_f - i_f) / (i_f + 1.0)).ln();
+    }
+    let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let sum: f64 = terms.iter().map(|term| (term - largest).exp()).sum();
+    -(largest + sum.ln()) / std::f64::consts::LN_10
 }
 
 /// The sum of squared residuals, what a rigid fit minimises.

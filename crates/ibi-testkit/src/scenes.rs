@@ -1,5 +1,7 @@
 //! Scenes with truth, from a seed, and the hard cases that every variant has to survive.
 
+use std::f64::consts::{PI, TAU};
+
 use nalgebra::{Isometry3, Point3, Vector3};
 
 use crate::Rng;
@@ -90,28 +92,43 @@ impl Recipe {
         }
         target.extend(floor(self.num_clutter, room(self.num_instances), self.num_points));
 
-        let mut labelled: Vec<([usize; 2], Option<usize>)> = Vec::new();
-        for instance in 0..self.num_instances {
-            let mut points: Vec<usize> = (0..self.num_points).collect();
-            rng.shuffle(&mut points);
-            for &point in &points[..self.true_pairs] {
-                labelled.push(([point, instance * self.num_points + point], Some(instance)));
-            }
-        }
-        for _ in 0..self.num_outliers {
-            let (point, row) = (rng.below(self.num_points), rng.below(target.len()));
-            // By chance it may be right after all.
-            let right = row < self.num_instances * self.num_points && row % self.num_points == point;
-            labelled.push(([point, row], right.then(|| row / self.num_points)));
-        }
-        // Nothing may depend on true pairs coming first.
-        rng.shuffle(&mut labelled);
-        let (rows, labels) = labelled.into_iter().unzip();
+        let sizes = [self.num_points, target.len(), self.num_instances];
+        let (rows, labels) = matched(sizes, self.true_pairs, self.num_outliers, &mut rng);
         Scene { name: self.name, source, target, rows, truth, labels }
     }
 }
 
 impl Scene {
+    /// Exact instances of `source` at `truth`, wherever that is, with `true_pairs` correspondences each and as many
+    /// wrong ones in all as true ones.
+    #[must_use]
+    pub fn placed(
+        name: &'static str,
+        source: Vec<Point3<f64>>,
+        truth: Vec<Isometry3<f64>>,
+        true_pairs: usize,
+    ) -> Self {
+        let target: Vec<_> = truth.iter().flat_map(|pose| source.iter().map(move |p| pose * p)).collect();
+        let sizes = [source.len(), target.len(), truth.len()];
+        let (rows, labels) = matched(sizes, true_pairs, true_pairs * truth.len(), &mut Rng::new(5));
+        Self { name, source, target, rows, truth, labels }
+    }
+
+    /// Instances of a symmetric shape without anything to tell its ends from each other: the source point of each
+    /// true correspondence is any of those that symmetry makes equal.
+    #[must_use]
+    pub fn symmetric(name: &'static str, shape: &Symmetric, num_instances: usize, true_pairs: usize) -> Self {
+        let truth = scattered_poses(num_instances, &mut Rng::new(6));
+        let mut scene = Self::placed(name, shape.points.clone(), truth, true_pairs);
+        let mut rng = Rng::new(7);
+        for (row, _) in scene.rows.iter_mut().zip(&scene.labels).filter(|(_, label)| label.is_some()) {
+            let turned = shape.symmetries[rng.below(shape.symmetries.len())] * shape.points[row[0]];
+            let off = |i: &usize| (shape.points[*i] - turned).norm_squared();
+            row[0] = (0..shape.points.len()).min_by(|i, j| off(i).total_cmp(&off(j))).unwrap_or(row[0]);
+        }
+        scene
+    }
+
     /// The same scene with its target moved.
     #[must_use]
     pub fn with_target_moved(mut self, motion: &Isometry3<f64>) -> Self {
@@ -163,6 +180,82 @@ impl Scene {
         };
         self.truth.iter().filter(|truth| found.iter().any(|pose| close(truth, pose))).count()
     }
+}
+
+/// [source row, target row] of each correspondence, and the instance it is true for.
+type Matched = (Vec<[usize; 2]>, Vec<Option<usize>>);
+
+/// Correspondences of a target that begins with all points of each instance; the sizes are those of the source, of
+/// the target, and the number of instances.
+fn matched(sizes: [usize; 3], true_pairs: usize, num_outliers: usize, rng: &mut Rng) -> Matched {
+    let [num_source, num_target, num_instances] = sizes;
+    let mut labelled: Vec<([usize; 2], Option<usize>)> = Vec::new();
+    for instance in 0..num_instances {
+        let mut points: Vec<usize> = (0..num_source).collect();
+        rng.shuffle(&mut points);
+        for &point in &points[..true_pairs] {
+            labelled.push(([point, instance * num_source + point], Some(instance)));
+        }
+    }
+    for _ in 0..num_outliers {
+        let (point, row) = (rng.below(num_source), rng.below(num_target));
+        // By chance it may be right after all.
+        let right = row < num_instances * num_source && row % num_source == point;
+        labelled.push(([point, row], right.then(|| row / num_source)));
+    }
+    // Nothing may depend on true pairs coming first.
+    rng.shuffle(&mut labelled);
+    labelled.into_iter().unzip()
+}
+
+/// A cloud and the motions that map it onto itself, the identity among them.
+#[derive(Debug, Clone)]
+pub struct Symmetric {
+    /// The points.
+    pub points: Vec<Point3<f64>>,
+    /// The motions.
+    pub symmetries: Vec<Isometry3<f64>>,
+}
+
+/// Turns about z by multiples of 1 / `n` of a full one, each also followed by half a turn about x.
+fn dihedral(n: usize) -> Vec<Isometry3<f64>> {
+    let turn = |k: usize| Isometry3::rotation(Vector3::z() * (TAU * k as f64 / n as f64));
+    let over = Isometry3::rotation(Vector3::x() * PI);
+    (0..n).flat_map(|k| [turn(k), over * turn(k)]).collect()
+}
+
+/// A torus about z, 2.4 across: 24 circles of 8 points.
+#[must_use]
+pub fn torus() -> Symmetric {
+    let point = |i: usize| {
+        let (around, (sin, cos)) = (TAU * (i / 8) as f64 / 24.0, (TAU * (i % 8) as f64 / 8.0).sin_cos());
+        Isometry3::rotation(Vector3::z() * around) * Point3::new(0.85 + 0.35 * cos, 0.0, 0.35 * sin)
+    };
+    Symmetric { points: (0..24 * 8).map(point).collect(), symmetries: dihedral(24) }
+}
+
+/// A cylinder about z, 1.2 across and 2 high, with its lids: rings of 16 points.
+#[must_use]
+pub fn cylinder() -> Symmetric {
+    let lids = [-1.0, 1.0].into_iter().flat_map(|z| [0.15, 0.375].map(|radius| (radius, z)));
+    let rings: Vec<(f64, f64)> = (0..9).map(|k| (0.6, 0.25 * f64::from(k) - 1.0)).chain(lids).collect();
+    let point = |(radius, z): (f64, f64), k: usize| {
+        let (sin, cos) = (TAU * k as f64 / 16.0).sin_cos();
+        Point3::new(radius * cos, radius * sin, z)
+    };
+    let points = rings.into_iter().flat_map(|ring| (0..16).map(move |k| point(ring, k))).collect();
+    Symmetric { points, symmetries: dihedral(16) }
+}
+
+/// The surface of a box of 2 x 1.2 x 0.8, in a grid of 0.2.
+#[must_use]
+pub fn cuboid() -> Symmetric {
+    let size = [10, 6, 4];
+    let is_outside = |k: [i32; 3]| (0..3).any(|axis| k[axis] == 0 || k[axis] == size[axis]);
+    let all = (0..11 * 7 * 5).map(|i| [i / 35, i / 5 % 7, i % 5]).filter(|&k| is_outside(k));
+    let middle = Vector3::new(1.0, 0.6, 0.4);
+    let points = all.map(|k| Point3::from(Vector3::from(k.map(|k| 0.2 * f64::from(k))) - middle)).collect();
+    Symmetric { points, symmetries: dihedral(2) }
 }
 
 /// A closed surface without any symmetry, about 2 across: evenly spread directions (Fibonacci lattice), with

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RADII", "dense_descriptors", "nearest"]
+__all__ = ["RADII", "dense_descriptors", "load_open3d", "nearest"]
 
 RADII = (0.15, 0.3, 0.5)
 """Radii of the three FPFH scales, in units of the shape's bounding sphere."""
@@ -18,7 +18,7 @@ _MIN_GROUP = 1000  # a sparser support would measure the sampling and not the su
 _NORMAL_NEIGHBORS = 30
 
 
-def _open3d() -> Any:
+def load_open3d() -> Any:
     """Open3D, imported late: it is optional, large and slow to load."""
     try:
         import open3d
@@ -58,13 +58,13 @@ def dense_descriptors(
     ImportError
         If Open3D is not installed; the message names the extra that brings it.
     """
-    _open3d()
+    load_open3d()
     return _cached(points.tobytes(), None if normals is None else normals.tobytes())
 
 
 @lru_cache(maxsize=64)
 def _cached(points_bytes: bytes, normals_bytes: bytes | None) -> NDArray[np.float32]:
-    o3d = _open3d()
+    o3d = load_open3d()
     points = np.frombuffer(points_bytes).reshape(-1, 3).copy()  # Open3D refuses read-only arrays
     if normals_bytes is None:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

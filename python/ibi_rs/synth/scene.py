@@ -34,6 +34,10 @@ class Scene:
         Layout, seed and shape.
     similarity : (M,) float64 or None
         How distinctive each match was, in [0, 1]; None where no descriptors were matched.
+    src_normals, tgt_normals : (N, 3) and (Q, 3) float64 or None
+        Unit normals estimated from the points, of either sign; None where the layout needs none.
+    distractors : tuple of str
+        Names of the other shapes in the target.
     """
 
     src: Array
@@ -42,6 +46,9 @@ class Scene:
     poses: Array
     name: str
     similarity: Array | None = None
+    src_normals: Array | None = None
+    tgt_normals: Array | None = None
+    distractors: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Summarise the scene in one line."""

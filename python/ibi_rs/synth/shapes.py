@@ -21,7 +21,7 @@ Array: TypeAlias = NDArray[np.float64]
 PointsNormals: TypeAlias = tuple[Array, Array]
 Vec: TypeAlias = tuple[float, float, float]
 
-DENSE_POINTS = 10_000  # surface points per shape, as in the layout of Tang and Zou (see `layouts`)
+DENSE_POINTS = 10_000  # surface points per shape, as in the layout of Tang and Zou (see `ecc`)
 
 
 class Box(NamedTuple):

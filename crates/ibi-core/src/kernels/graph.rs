@@ -24,6 +24,8 @@ pub struct EdgeTest {
     pub max_length: f32,
     /// How far the three angles of a pair of oriented points may differ, in cosine.
     pub normal_tolerance: f32,
+    /// Whether edges are weighed by what their ends have in common, or by their own rigidity alone.
+    pub second_order: bool,
 }
 
 /// Unit normals at the two points of each correspondence.
@@ -33,6 +35,8 @@ pub struct PairNormals {
     pub source: Vec<Vector3<f32>>,
     /// At q_i.
     pub target: Vec<Vector3<f32>>,
+    /// Whether the sign of a normal means something (outwards, or towards the camera).
+    pub oriented: bool,
 }
 
 /// Compressed rows: the neighbours of each correspondence, ascending, and the second-order weight of the edge;
@@ -62,7 +66,9 @@ impl Graph {
         interrupted: impl Fn() -> bool + Sync,
     ) -> Self {
         let mut graph = Self::first_order(pairs, normals, test, &interrupted);
-        graph.weights = graph.second_order(&interrupted);
+        if test.second_order {
+            graph.weights = graph.second_order(&interrupted);
+        }
         graph.alive = vec![true; graph.len()];
         graph.futile = (0..graph.len()).map(|_| AtomicBool::new(false)).collect();
         graph.support = par::map(graph.len(), 64, |i| graph.supported(i as u32));
@@ -246,17 +252,24 @@ impl PairNormals {
     #[must_use]
     pub fn agree(&self, i: u32, target_from_source: &Isometry3<f64>, min_cos: f64) -> bool {
         let rotation = target_from_source.rotation.cast::<f32>();
-        (rotation * self.source[i as usize]).dot(&self.target[i as usize]) >= min_cos as f32
+        let cos = (rotation * self.source[i as usize]).dot(&self.target[i as usize]);
+        up_to_sign(cos, self.oriented) >= min_cos as f32
     }
 
     /// Whether n_i.n_j, n_i.d and n_j.d agree on both sides, d being the unit vector from i to j: all that a
     /// rigid motion keeps of two oriented points beside their distance (Drost et al. 2010 use them as a feature).
+    /// Without orientation their magnitudes must.
     fn compatible(&self, i: usize, j: usize, pairs: &Columns, tolerance: f32) -> bool {
         let side = |n: &[Vector3<f32>], c: &[Vec<f32>; 3]| {
             let d = Vector3::new(c[0][j] - c[0][i], c[1][j] - c[1][i], c[2][j] - c[2][i]).normalize();
-            [n[i].dot(&n[j]), n[i].dot(&d), n[j].dot(&d)]
+            [n[i].dot(&n[j]), n[i].dot(&d), n[j].dot(&d)].map(|cos| up_to_sign(cos, self.oriented))
         };
         let (p, q) = (side(&self.source, &pairs.p), side(&self.target, &pairs.q));
         p.iter().zip(q).all(|(a, b)| (a - b).abs() <= tolerance)
     }
+}
+
+/// A cosine between two normals, or its magnitude where their signs are arbitrary.
+pub(crate) fn up_to_sign<T: nalgebra::RealField + Copy>(cos: T, oriented: bool) -> T {
+    if oriented { cos } else { cos.abs() }
 }

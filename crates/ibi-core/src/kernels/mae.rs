@@ -24,11 +24,10 @@ pub fn mae(pairs: &Columns, target_from_source: &Isometry3<f64>, t_he: f64) -> f
 pub fn close_pairs(pairs: &Columns, target_from_source: &Isometry3<f64>, t_he: f64) -> Vec<u32> {
     let residual_sq = residual_sq(pairs, target_from_source);
     let t_he_sq = (t_he * t_he) as f32;
-    let is_close = |i: &u32| {
-        let (p, q) = pairs.pair(*i as usize);
-        residual_sq(p, q) < t_he_sq
-    };
-    (0..pairs.len() as u32).filter(is_close).collect()
+    // All residuals first: that vectorises, and few are small.
+    let mut residuals_sq = vec![0.0; pairs.len()];
+    pairs.map_into(&mut residuals_sq, residual_sq);
+    (0_u32..).zip(residuals_sq).filter(|&(_, r)| r < t_he_sq).map(|(i, _)| i).collect()
 }
 
 /// |T p - q|^2 as a function of (p, q), in the frame and unit of the columns.

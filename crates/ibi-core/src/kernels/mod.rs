@@ -5,6 +5,7 @@
 
 pub mod columns;
 pub mod compatibility;
+pub mod evidence;
 pub mod graph;
 pub mod grid;
 pub mod icp;

@@ -33,6 +33,15 @@ impl Neighbors {
         Some((hit.item, hit.distance))
     }
 
+    /// Rows of the points within `distance` of the query, in no particular order.
+    pub fn within(&self, query: &Point3<f64>, distance: f64) -> impl Iterator<Item = u32> + use<> {
+        let hits = self
+            .tree
+            .as_ref()
+            .map(|tree| tree.within_unsorted::<SquaredEuclidean>(&query.coords.into(), distance * distance));
+        hits.into_iter().flatten().map(|hit| hit.item)
+    }
+
     /// Mean distance from a point of `points` (those the tree was built from) to its nearest other point; 0
     /// for fewer than two points. Points that coincide are 0 apart.
     #[must_use]

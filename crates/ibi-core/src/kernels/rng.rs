@@ -1,5 +1,9 @@
 //! Random numbers, keyed by (seed, round, stage) so that no stage's draw depends on another's or on threads.
 
+use std::f64::consts::TAU;
+
+use nalgebra::{Quaternion, UnitQuaternion};
+
 /// `SplitMix64` (Steele, Lea & Flood 2014): one word of state, and good enough to draw samples.
 #[derive(Debug, Clone)]
 pub struct Rng(u64);
@@ -25,6 +29,18 @@ impl Rng {
     /// Uniform in `0..n`; `n` > 0. The bias of the multiply-shift is below n / 2^64.
     pub fn below(&mut self, n: usize) -> usize {
         ((u128::from(self.next_u64()) * n as u128) >> 64) as usize
+    }
+
+    /// Uniform in [0, 1).
+    pub fn unit(&mut self) -> f64 {
+        (self.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// A rotation, all equally likely (Shoemake 1992).
+    pub fn rotation(&mut self) -> UnitQuaternion<f64> {
+        let (u, a, b) = (self.unit(), self.unit() * TAU, self.unit() * TAU);
+        let (s, c) = ((1.0 - u).sqrt(), u.sqrt());
+        UnitQuaternion::new_normalize(Quaternion::new(c * b.cos(), s * a.sin(), s * a.cos(), c * b.sin()))
     }
 
     /// `count` distinct members of `ids`, every subset equally likely, in the order of `ids`; all of them if

@@ -14,6 +14,7 @@ use nalgebra::Isometry3;
 
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
+use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::mae::close_pairs;
 use crate::kernels::rng::Rng;
@@ -65,6 +66,8 @@ pub struct Context<'a> {
     pub claimed: &'a [bool],
     /// The compatibility graph of all correspondences, built by the first stage that wants it.
     pub graph: &'a OnceLock<Graph>,
+    /// What chance brings in this scene.
+    pub(crate) chance: &'a OnceLock<Chance>,
     /// Asked by long computations, which may then return anything: the round is thrown away.
     pub interrupt: &'a Interrupt,
 }
@@ -97,21 +100,74 @@ impl Context<'_> {
     pub fn spent(&self, target_from_source: &Isometry3<f64>) -> Vec<u32> {
         let ids = self.alive.ids();
         let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
-        let explained = self.scene.explained(self.params, target_from_source, &targets);
+        let explained = self.scene.nearest_source(self.params.d_op_pr, target_from_source, &targets);
         let mut spent = self.inliers(target_from_source, 2.0 * self.params.t_he_pr);
-        spent.extend(ids.iter().zip(explained).filter(|&(_, yes)| yes).map(|(&id, _)| id));
+        spent.extend(ids.iter().zip(explained).filter(|(_, by)| by.is_some()).map(|(&id, _)| id));
         spent.sort_unstable();
         spent.dedup();
         spent
     }
 
-    /// The hypothesis polished on the clouds, as the parameters want it. `None` if that has carried it away from
-    /// its correspondences, so that fewer than `t_s` alive ones still agree: the clouds alone fit flat faces
-    /// almost anywhere.
+    /// What speaks for a pose: the alive correspondences, and the scene points, if `exclusive` only those that no
+    /// accepted instance has claimed.
+    #[must_use]
+    pub fn support(&self, target_from_source: &Isometry3<f64>, exclusive: bool) -> Support {
+        let t_he = self.length(self.params.t_he_pr);
+        let chance = self.chance.get_or_init(|| Chance {
+            agreement: self.pairs.chances(self.scene, self.params),
+            fit: self.scene.chance_fit(self.params),
+        });
+        let ids = self.alive.ids();
+        let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
+        let reach_pr = 2.0 * self.params.d_op_pr;
+        let (reach, d_op) = (self.length(reach_pr), self.length(self.params.d_op_pr));
+        let nearest = self.scene.nearest_source(reach_pr, target_from_source, &targets);
+        let (mut num_explained, mut num_agreeing, mut expected) = (0, 0, 0.0);
+        let (mut num_near, mut back_fit) = (0, 0.0);
+        for (&id, nearest) in ids.iter().zip(nearest) {
+            let Some((row, distance)) = nearest else { continue };
+            num_near += 1;
+            back_fit += 1.0 - distance / reach;
+            if distance > d_op {
+                continue;
+            }
+            num_explained += 1;
+            expected += f64::from(chance.agreement[row as usize]);
+            let id = id as usize;
+            let residual_sq =
+                (target_from_source * self.pairs.source[id] - self.pairs.target[id]).norm_squared();
+            num_agreeing +=
+                u32::from(residual_sq < t_he * t_he && self.normals_agree(id as u32, target_from_source));
+        }
+        let fit = self.scene.fit(self.params, target_from_source, exclusive.then_some(self.claimed));
+        Support {
+            num_explained,
+            num_agreeing,
+            chance: expected / f64::from(num_explained.max(1)),
+            fit,
+            back_fit: back_fit / f64::from(num_near.max(1)),
+            chance_fit: chance.fit,
+            one_sided: self.scene.is_one_sided(self.params),
+        }
+    }
+
+    fn normals_agree(&self, id: u32, target_from_source: &Isometry3<f64>) -> bool {
+        match (&self.pairs.normals, self.params.min_normal_cos) {
+            (Some(normals), Some(min_cos)) => normals.agree(id, target_from_source, min_cos),
+            _ => true,
+        }
+    }
+
+    /// The hypothesis polished on the clouds. `None` if the parameters do not want it, or if it has carried the pose
+    /// away from its correspondences, so that fewer than `t_s` alive ones still agree: the clouds alone fit flat
+    /// faces almost anywhere.
     #[must_use]
     pub fn refined(&self, hypothesis: Hypothesis) -> Option<Hypothesis> {
         let target_from_source = match self.params.refine {
-            Refine::None => return Some(hypothesis),
+            Refine::None => return None,
+            Refine::Icp if self.scene.is_hopeless(self.params, &hypothesis.target_from_source) => {
+                return None;
+            }
             Refine::Icp => self.scene.icp(self.params, &hypothesis.target_from_source),
         };
         let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
@@ -124,6 +180,15 @@ impl Context<'_> {
     pub fn rng(&self, stage: Stage) -> Rng {
         Rng::new(self.params.seed, self.round, stage as u32)
     }
+}
+
+/// What chance brings in a scene.
+#[derive(Debug)]
+pub(crate) struct Chance {
+    /// For each source point the share of all correspondences that would agree with it.
+    agreement: Vec<f32>,
+    /// The fit of a pose somewhere on the target.
+    fit: f64,
 }
 
 /// The stages, as keys of random streams.
@@ -146,18 +211,21 @@ pub struct Ranked {
 impl Ranked {
     /// Ranks `(id, score)` pairs; the ids must differ.
     #[must_use]
-    pub fn new(mut scored: Vec<(u32, f32)>) -> Self {
-        scored.sort_unstable_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-        let (ids, scores) = scored.into_iter().unzip();
-        Self { ids, scores }
+    pub fn new(scored: Vec<(u32, f32)>) -> Self {
+        Self::best_of(scored, usize::MAX)
     }
 
-    /// Keeps the best `n`.
+    /// Ranks the best `n` of `(id, score)` pairs; the ids must differ.
     #[must_use]
-    pub fn best(mut self, n: usize) -> Self {
-        self.ids.truncate(n);
-        self.scores.truncate(n);
-        self
+    pub fn best_of(mut scored: Vec<(u32, f32)>, n: usize) -> Self {
+        let order = |a: &(u32, f32), b: &(u32, f32)| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0));
+        if n < scored.len() {
+            scored.select_nth_unstable_by(n, order);
+            scored.truncate(n);
+        }
+        scored.sort_unstable_by(order);
+        let (ids, scores) = scored.into_iter().unzip();
+        Self { ids, scores }
     }
 
     /// The ids, best first.

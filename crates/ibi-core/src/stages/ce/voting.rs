@@ -32,6 +32,6 @@ impl Enhance for Voting {
     fn enhance(&self, context: &Context<'_>, seeds: &Ranked) -> Ranked {
         let voters = context.pairs.columns.gather(seeds.ids());
         let votes = votes(context.alive.columns(), &voters, context.params.delta_r_pr);
-        Ranked::new(context.alive.ids().iter().copied().zip(votes).collect()).best(self.n_vot as usize)
+        Ranked::best_of(context.alive.ids().iter().copied().zip(votes).collect(), self.n_vot as usize)
     }
 }

@@ -1,9 +1,11 @@
 //! HV, hypothesis validation: pose, source, target -> accepted or rejected.
 
+mod evidence;
 mod inlier_count;
 mod none;
 mod overlap;
 
+pub use evidence::Evidence;
 pub use inlier_count::InlierCount;
 pub use none::None;
 pub use overlap::Overlap;
@@ -15,6 +17,8 @@ variants! {
     Hv {
         /// Share of source points that lie on the target.
         Overlap = "overlap",
+        /// What speaks for the pose, against what chance would bring.
+        Evidence = "evidence",
         /// Number of alive correspondences that agree.
         InlierCount = "inlier_count",
         /// Everything is accepted.
@@ -26,6 +30,7 @@ impl Validate for Hv {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
         match self {
             Self::Overlap(overlap) => overlap.validate(context, hypothesis),
+            Self::Evidence(evidence) => evidence.validate(context, hypothesis),
             Self::InlierCount(count) => count.validate(context, hypothesis),
             Self::None(none) => none.validate(context, hypothesis),
         }

@@ -1,3 +1,6 @@
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+
 use super::gtm::OTSU_BINS;
 use crate::error::Error;
 use crate::kernels::graph::{EdgeTest, Graph};
@@ -29,13 +32,15 @@ pub struct LocalGtm {
     pub min_length_pr: f64,
     /// With normals: how far the angles between two oriented points may differ, in cosine. > 0.
     pub normal_tolerance: f64,
+    /// Whether an edge is weighed by what its two ends have in common, or by its own rigidity alone.
+    pub second_order: bool,
     /// `N_gtm`: generations of the replicator. At least 1.
     pub n_gtm: u32,
 }
 
 impl Default for LocalGtm {
     fn default() -> Self {
-        Self { tau_pr: 1.0, min_length_pr: 1.0, normal_tolerance: 0.35, n_gtm: 20 }
+        Self { tau_pr: 1.0, min_length_pr: 1.0, normal_tolerance: 0.5, second_order: true, n_gtm: 20 }
     }
 }
 
@@ -54,6 +59,7 @@ impl LocalGtm {
             min_length: self.min_length_pr as f32,
             max_length: (diameter_pr + self.tau_pr) as f32,
             normal_tolerance: self.normal_tolerance as f32,
+            second_order: self.second_order,
         };
         let interrupted = || context.interrupt.is_set();
         let mut graph =
@@ -115,12 +121,15 @@ impl SelectSeeds for LocalGtm {
     fn select_seeds(&self, context: &Context<'_>) -> Ranked {
         let graph = context.graph.get_or_init(|| self.build(context));
 
-        let may_lead = |i: u32| !context.barred[i as usize] && !graph.is_futile(i);
-        let supported = context.alive.ids().iter().filter(|&&i| may_lead(i)).map(|&i| (i, graph.support(i)));
-        let leaders = Ranked::new(supported.filter(|&(_, support)| support > 0.0).collect());
+        let may_lead = |i: u32| !context.barred[i as usize] && !graph.is_futile(i) && graph.support(i) > 0.0;
+        // The first or second leader will do in most rounds, so they are not sorted. Supports are positive: their bits
+        // order them.
+        let key = |&i: &u32| (graph.support(i).to_bits(), Reverse(i));
+        let leaders = context.alive.ids().iter().filter(|&&i| may_lead(i)).map(key);
+        let mut leaders: BinaryHeap<_> = leaders.collect();
         let enough = context.params.t_s as usize;
         let mut most = Ranked::default();
-        for &leader in leaders.ids() {
+        while let Some((_, Reverse(leader))) = leaders.pop() {
             let seeds = self.play(context, graph, leader);
             if seeds.len() >= enough || context.interrupt.is_set() {
                 return seeds;

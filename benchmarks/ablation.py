@@ -1,0 +1,181 @@
+"""What each part of the default preset is worth: leaves out one at a time, prints a table, draws one scene.
+
+    python benchmarks/ablation.py                      # or: make tables
+    python benchmarks/ablation.py --half tuning --scenes 3
+
+The scenes and the scores are those of benchmarks/accuracy.py, one to one. A cell holds MHF1, the number of
+poses returned and of instances present, and the median time in ms. Where there is nothing to find, MHF1 is
+the share of scenes in which nothing was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import ibi_rs as ibi
+import numpy as np
+from accuracy import RECORDS, Result, register, run, write_record
+from ibi_rs import metrics, synth
+from layouts import FIRST_SEED, LAYOUTS, NO_NORMALS, scene_of
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull
+
+FIGURES = Path(__file__).parents[1] / "docs/figures"
+
+DEFAULT = ibi.Params()
+VARIANTS = {
+    "default": DEFAULT,
+    "no second order": DEFAULT.replace(scs=ibi.LocalGtm(second_order=False)),
+    # The joint check shares out the scene points and so relies on claims.
+    "no exclusive claims": DEFAULT.replace(hv=ibi.Evidence(exclusive=False), joint_check=False),
+    "dense removal": DEFAULT.replace(removal="dense"),
+    "no joint check": DEFAULT.replace(joint_check=False),
+    "no refinement": DEFAULT.replace(refine="none"),
+    "no contest": DEFAULT.replace(n_contest=1),
+    "overlap 0.7, no evidence": DEFAULT.replace(hv=ibi.Overlap(t_overlap=0.7, exclusive=True)),
+}
+NORMALS = {"no normals": NO_NORMALS["default, no normals"]}
+ABLATED = ("ecc-0.1", "outlier-inexact-90-99", "fpfh", "none")
+PICTURED = ("ecc-0.3", 5014)
+"""The layout and the seed of the picture: a scene on which most variants differ."""
+
+
+def variants(layout: str) -> dict[str, ibi.Params]:
+    """Return the variants that differ on a layout."""
+    return VARIANTS | NORMALS if LAYOUTS[layout].presets is NO_NORMALS else VARIANTS
+
+
+# Table ----------------------------------------------------------------------------------------------------
+
+
+def cell(rows: list[Result]) -> str:
+    """Sum up one variant on one layout."""
+    if not rows:
+        return "–"
+    mhf1 = metrics.mean_score(row.one_to_one for row in rows).mhf1
+    poses = sum(row.one_to_one.num_predicted for row in rows)
+    truths = sum(row.one_to_one.num_truth for row in rows)
+    return f"{mhf1:.3f} · {poses}/{truths} · {np.median([row.ms for row in rows]):.0f}"
+
+
+def print_table(results: dict[str, list[Result]]) -> None:
+    """Print a line per variant, a column per layout, as Markdown."""
+    print("\nMHF1 · poses returned / instances present · median ms\n")
+    print(f"| | {' | '.join(results)} |\n|---|{'---|' * len(results)}")
+    for name in VARIANTS | NORMALS:
+        cells = [cell([row for row in rows if row.params == name]) for rows in results.values()]
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+# Picture --------------------------------------------------------------------------------------------------
+
+SCENE, RIGHT, WRONG, MISSED = "0.8", "tab:blue", "tab:red", "black"
+
+
+def view(poses: np.ndarray) -> np.ndarray:
+    """Return the projection onto a plane, (3, 2), on which the instances lie farthest apart."""
+    centers = poses[:, :3, 3]
+    rotations = np.linalg.qr(np.random.default_rng(0).normal(size=(500, 3, 3)))[0]
+
+    def gap(plane: np.ndarray) -> float:
+        flat = centers @ plane
+        apart = np.linalg.norm(flat[:, None] - flat, axis=2)
+        return float(np.min(apart[np.triu_indices(len(flat), 1)]))
+
+    planes: list[np.ndarray] = [rotation[:, :2] for rotation in rotations]
+    return max(planes, key=gap)
+
+
+def draw(scene: synth.Scene, found: dict[str, ibi.Registration], path: Path) -> None:
+    """Draw the scene once for each variant: right poses, wrong ones, missed instances."""
+    columns = 4
+    rows = -(-len(found) // columns)
+    figure = Figure(figsize=(3.5 * columns, 3.9 * rows + 0.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    plane = view(scene.poses)
+    # All instances and poses, and a margin: the clutter goes on beyond.
+    middles = np.vstack([scene.poses, *(np.asarray(registration) for registration in found.values())])
+    flat = middles[:, :3, 3] @ plane
+    limits = flat.min(axis=0) - 1.2, flat.max(axis=0) + 1.2
+    for i, (name, registration) in enumerate(found.items()):
+        axes = figure.add_subplot(rows, columns, i + 1)
+        draw_one(axes, scene, registration, plane)
+        axes.set(xlim=(limits[0][0], limits[1][0]), ylim=(limits[0][1], limits[1][1]))
+        score = metrics.score_scene(registration, scene.poses)
+        right, wrong = score.num_predicted_hit, score.num_predicted - score.num_predicted_hit
+        missed = score.num_truth - score.num_truth_hit
+        axes.set_title(f"{name}\n{right} right, {wrong} wrong, {missed} missed")
+    handles = figure.axes[0].get_legend_handles_labels()[0]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+    print(f"\npicture: {path.name}, {scene.name}")
+
+
+def draw_one(axes: Any, scene: synth.Scene, found: ibi.Registration, plane: np.ndarray) -> None:
+    """Draw one result."""
+    score = metrics.score_scene(found, scene.poses)
+    hits = [match is not None and match.is_hit for match in score.matches]
+    reached = {match.truth for match in score.matches if match is not None and match.is_hit}
+    poses = np.asarray(found)
+
+    def put(poses: Any, colour: str, label: str, style: dict[str, Any], fill: bool) -> None:
+        for pose in poses:
+            flat = (scene.src @ pose[:3, :3].T + pose[:3, 3]) @ plane
+            if fill:
+                axes.scatter(*flat.T, s=0.6, color=colour, linewidths=0, zorder=2)
+            hull = flat[ConvexHull(flat).vertices]
+            axes.fill(*hull.T, fill=False, edgecolor=colour, zorder=3, **style)
+        axes.plot([], [], color=colour, label=label, **style)
+
+    flat = scene.tgt @ plane
+    axes.scatter(*flat.T, s=1.2, color=SCENE, linewidths=0, zorder=1)
+    axes.plot([], [], "o", color=SCENE, label="scene")
+    put(poses[np.flatnonzero(hits)], RIGHT, "right pose", {"linewidth": 1.2}, True)
+    put(poses[np.flatnonzero(np.logical_not(hits))], WRONG, "wrong pose", {"linewidth": 1.8}, True)
+    missed = [pose for k, pose in enumerate(scene.poses) if k not in reached]
+    put(missed, MISSED, "missed instance", {"linewidth": 1.5, "linestyle": "--"}, False)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def main() -> None:
+    """Run, print, record, draw."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--half", choices=FIRST_SEED, default="reporting")
+    parser.add_argument("--scenes", type=int, default=10, help="so many of each layout; default: 10")
+    parser.add_argument("--jobs", type=int, default=1, help="processes; times are then those of one thread")
+    parser.add_argument("--seed", type=int, default=PICTURED[1], help="of the scene in the picture")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="folder for the record and the picture; by default benchmarks/records and docs/figures, and "
+        "none at all where an option is not the default",
+    )
+    args = parser.parse_args()
+    usual = all(parser.get_default(name) == value for name, value in vars(args).items())
+    print(f"{os.cpu_count()} cores, {platform.machine()}, ibi_rs {ibi.__version__}, {args.half} half", end="")
+    print(f", {args.scenes} scenes a layout")
+    results = {
+        layout: run(layout, args.half, args.scenes, variants(layout), jobs=args.jobs) for layout in ABLATED
+    }
+    print_table(results)
+    if usual or args.out:
+        write_record(
+            (args.out or RECORDS) / "ablation.csv", [row for rows in results.values() for row in rows]
+        )
+        layout, _ = PICTURED
+        scene = scene_of(layout, args.half, args.seed)
+        found = {name: register(scene, params) for name, params in variants(layout).items()}
+        draw(scene, found, (args.out or FIGURES) / "ablation.png")
+
+
+if __name__ == "__main__":
+    main()
