@@ -322,6 +322,7 @@ impl<'a> State<'a> {
         let shares = params.joint_check.then(|| Shares::new(&self.problem, &self.found));
         let (everything, unclaimed) =
             (Alive::all(&self.problem.pairs), vec![false; self.problem.claimed.len()]);
+        self.problem.context(params, 0).chance();
         let mut measured: Vec<(Pose, Vec<f64>)> = par::map(self.found.len(), 1, |at| {
             let found = &self.found[at];
             let support = match &shares {

@@ -113,10 +113,7 @@ impl Context<'_> {
     #[must_use]
     pub fn support(&self, target_from_source: &Isometry3<f64>, exclusive: bool) -> Support {
         let t_he = self.length(self.params.t_he_pr);
-        let chance = self.chance.get_or_init(|| Chance {
-            agreement: self.pairs.chances(self.scene, self.params),
-            fit: self.scene.chance_fit(self.params),
-        });
+        let chance = self.chance();
         let ids = self.alive.ids();
         let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
         let reach_pr = 2.0 * self.params.d_op_pr;
@@ -149,6 +146,15 @@ impl Context<'_> {
             chance_fit: chance.fit,
             one_sided: self.scene.is_one_sided(self.params),
         }
+    }
+
+    /// What chance brings, measured when first asked for. Not to be asked first from within a parallel map: the
+    /// measurement is one itself, and a thread that waits in it may take up another that waits for it.
+    pub(crate) fn chance(&self) -> &Chance {
+        self.chance.get_or_init(|| Chance {
+            agreement: self.pairs.chances(self.scene, self.params),
+            fit: self.scene.chance_fit(self.params),
+        })
     }
 
     fn normals_agree(&self, id: u32, target_from_source: &Isometry3<f64>) -> bool {
