@@ -391,7 +391,9 @@ fn rotations_are_uniform() {
             let square = turned.iter().map(|v| v[along].powi(2)).sum::<f64>() / n;
             assert!((square - 1.0 / 3.0).abs() < 0.01, "{square}");
             let mut counts = [0_u32; 20];
-            turned.iter().for_each(|v| counts[(((v[along] + 1.0) * 10.0) as usize).min(19)] += 1);
+            for v in &turned {
+                counts[(((v[along] + 1.0) * 10.0) as usize).min(19)] += 1;
+            }
             let chi_square: f64 =
                 counts.iter().map(|&c| (f64::from(c) - n / 20.0).powi(2) / (n / 20.0)).sum();
             assert!(chi_square < 43.8, "{chi_square}");

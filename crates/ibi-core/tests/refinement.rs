@@ -410,7 +410,9 @@ fn a_refined_pose_must_keep_the_agreement_of_its_correspondences() {
     let off = Isometry3::translation(0.5 * spacing, 0.0, 0.0);
     for params in with_each_validation(&Params { t_he_pr: 0.3, ..Params::default() }) {
         let pose = |agreeing_with, refine| {
-            judged(off, agreeing_with, Params { refine, ..params.clone() }).1.expect(params.hv.name())
+            judged(off, agreeing_with, Params { refine, ..params.clone() })
+                .1
+                .unwrap_or_else(|| panic!("{}", params.hv.name()))
         };
         // Carried to where the clouds fit: good if the correspondences say so too, also where the measure cannot
         // tell the two poses apart.
