@@ -40,7 +40,7 @@ VARIANTS = {
     "overlap 0.7, no evidence": DEFAULT.replace(hv=ibi.Overlap(t_overlap=0.7, exclusive=True)),
 }
 NORMALS = {"no normals": NO_NORMALS["default, no normals"]}
-ABLATED = ("ecc-0.1", "outlier-inexact-90-99", "fpfh", "none")
+ABLATED = ("ecc-0.1", "outlier-inexact-90-99", "fpfh", "symmetric", "none")
 PICTURED = ("ecc-0.3", 5014)
 """The layout and the seed of the picture: a scene on which most variants differ."""
 

@@ -1,6 +1,11 @@
 //! The default preset on scenes whose truth is known: all instances, each once, nothing else, whatever the frame, the
 //! unit, the order, the signs of normals and the threads.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::float_cmp,
+    reason = "tests may panic, and compare what is exact"
+)]
 
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::{Cloud, Correspondences, Params, Pose, Registrar, Registration};
@@ -22,16 +27,23 @@ fn gap(points: &[Point3<f64>], a: &Isometry3<f64>, b: &Isometry3<f64>) -> f64 {
     points.iter().map(|p| (a * p - b * p).norm()).fold(0.0, f64::max)
 }
 
+/// What to print of a result.
+fn places_and_scores(result: &Registration) -> Vec<([f64; 3], f64)> {
+    let both = |pose: &Pose| (pose.target_from_source.translation.vector.into(), pose.score);
+    result.poses.iter().map(both).collect()
+}
+
 /// Every instance is found, where it is up to `tolerance`, once, and nothing else is; scores are sure of it.
 fn check_found(scene: &Scene, result: &Registration, tolerance: f64) {
     let name = scene.name;
     let is_at = |pose: &Pose, truth| gap(&scene.source, &pose.target_from_source, truth) < tolerance;
     for truth in &scene.truth {
         let hits = result.poses.iter().filter(|pose| is_at(pose, truth)).count();
-        assert_eq!(hits, 1, "{name}: {truth} among {:?}", result.poses);
+        assert_eq!(hits, 1, "{name}: {truth} among {:?}", places_and_scores(result));
     }
-    assert_eq!(result.poses.len(), scene.truth.len(), "{name}: something else in {:?}", result.poses);
-    assert!(result.poses.iter().all(|pose| (0.9..=1.0).contains(&pose.score)), "{name}: {:?}", result.poses);
+    let listed = places_and_scores(result);
+    assert_eq!(listed.len(), scene.truth.len(), "{name}: something else in {listed:?}");
+    assert!(listed.iter().all(|(_, score)| (0.9..=1.0).contains(score)), "{name}: {listed:?}");
     for (label, expected) in result.labels.iter().zip(&scene.labels) {
         let Some(instance) = expected else { continue };
         let pose = &result.poses[label.expect("a true correspondence is an inlier") as usize];
@@ -64,7 +76,7 @@ fn recipes() -> impl Strategy<Value = Recipe> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(32))]
+    #![proptest_config(ProptestConfig::with_cases(1500))]
 
     #[test]
     fn every_instance_is_found_once_and_nothing_else_is(recipe in recipes()) {
@@ -87,7 +99,9 @@ proptest! {
 /// Poses by place, as if their frame and unit were those of the scene.
 fn poses_by_place(result: &Registration, frame: &Isometry3<f64>, unit: f64) -> Vec<Isometry3<f64>> {
     let mut poses: Vec<_> = result.poses.iter().map(|pose| frame * pose.target_from_source).collect();
-    poses.iter_mut().for_each(|pose| pose.translation.vector /= unit);
+    for pose in &mut poses {
+        pose.translation.vector /= unit;
+    }
     poses.sort_by(|a, b| a.translation.x.total_cmp(&b.translation.x));
     poses
 }
@@ -98,7 +112,7 @@ fn score_gap(a: &Registration, b: &Registration) -> f64 {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(12))]
+    #![proptest_config(ProptestConfig::with_cases(300))]
 
     #[test]
     fn neither_order_nor_frame_nor_unit_matters(
@@ -155,36 +169,19 @@ fn a_scene_without_an_instance_gives_no_pose() {
     }
 }
 
-/// Two instances are there but no correspondence was made to be true. A few are by chance, and more are nearly: what
-/// they lead to has to be right.
+/// Two instances are there but no correspondence was made to be true. What the few lead to that nearly are by chance
+/// may be turned over, as the model is not much different then, but it lies on an instance, and alone.
 #[test]
-fn what_chance_leads_to_is_right_or_rejected() {
-    for num_points in [100, 200, 300, 500, 1000] {
-        for seed in 0..6 {
-            let scene =
-                Recipe { seed, true_pairs: 0, num_outliers: 3 * num_points, num_points, ..Recipe::default() }
-                    .build();
-            print!("{num_points} ");
-            let result = register(&scene, 2);
-            let off = |pose: &Pose| {
-                let gaps =
-                    scene.truth.iter().map(|truth| gap(&scene.source, &pose.target_from_source, truth));
-                gaps.fold(f64::INFINITY, f64::min)
+fn what_chance_leads_to_fits_and_is_found_once() {
+    for seed in 0..6 {
+        let scene = Recipe { seed, true_pairs: 0, num_outliers: 300, ..Recipe::default() }.build();
+        let result = register(&scene, 2);
+        assert!(result.poses.iter().all(|pose| pose.overlap > 0.9 && pose.closeness > 0.5), "{seed}");
+        for truth in &scene.truth {
+            let is_here = |pose: &&Pose| {
+                (pose.target_from_source.translation.vector - truth.translation.vector).norm() < 0.5
             };
-            for p in &result.poses {
-                println!(
-                    "{seed} off {:.3} pr {:.3} score {:.3} cl {:.3} bf {:.3} ev {:.3} {} round {}",
-                    off(p),
-                    result.resolution,
-                    p.score,
-                    p.closeness,
-                    p.back_fit,
-                    p.evidence,
-                    p.inliers.len(),
-                    p.round
-                );
-            }
-            println!("x");
+            assert!(result.poses.iter().filter(is_here).count() <= 1, "{seed}");
         }
     }
 }
@@ -197,7 +194,7 @@ fn touching_and_interpenetrating_instances_are_all_found() {
     for places in [&[0.0, 1.9][..], &[0.0, 1.2], &[0.0, 0.9]] {
         for _ in 0..3 {
             let truth = places.iter().map(|&x| rng.pose_at(Vector3::new(x, 0.0, 0.0))).collect();
-            let scene = Scene::placed("heap", source.clone(), truth, 100);
+            let scene = Scene::placed("touching", source.clone(), truth, 100);
             check_found(&scene, &register(&scene, 2), 1e-9);
         }
     }
@@ -214,7 +211,7 @@ fn symmetric_instances_are_found_once() {
         for (num_instances, true_pairs) in [(1, 100), (3, 60), (4, 150)] {
             let scene = Scene::symmetric(name, &shape, num_instances, true_pairs);
             let result = register(&scene, 2);
-            assert_eq!(result.poses.len(), num_instances, "{name}: {:?}", result.poses);
+            assert_eq!(result.poses.len(), num_instances, "{name}: {:?}", places_and_scores(&result));
             for truth in &scene.truth {
                 let is_here = |pose: &&Pose| {
                     let off = |turn| gap(&scene.source, &pose.target_from_source, &(truth * turn));
@@ -229,7 +226,7 @@ fn symmetric_instances_are_found_once() {
 
 // ----------------------------------------------------------------------------------------------------- normals
 
-/// How far a pose is off that ended with eight damped steps onto tangent planes: they converge, but linearly.
+/// With normals refinement pulls to planes, and is damped: it ends near the truth, not on it.
 const POLISHED: f64 = 1e-6;
 
 /// The run on a scene of nothing but instances, each normal the other way round where the turn of its row says so.
@@ -266,7 +263,7 @@ fn scene_without_clutter() -> Scene {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(8))]
+    #![proptest_config(ProptestConfig::with_cases(100))]
 
     #[test]
     fn the_signs_of_unoriented_normals_change_nothing(
@@ -297,5 +294,5 @@ fn the_signs_of_oriented_normals_count() {
     }
     // Half of them wrong: half as close.
     let half = with_normals(&scene, [&as_they_are, &every_second], None, true);
-    assert!(half.poses.iter().all(|pose| pose.closeness < 0.6), "{:?}", half.poses);
+    assert!(half.poses.iter().all(|pose| pose.closeness < 0.6), "{:?}", places_and_scores(&half));
 }
