@@ -157,9 +157,9 @@ def draw(bins: list[Bin], path: Path) -> None:
     low, high = np.transpose([b.interval() for b in bins])
     errors = [np.maximum(y - low, 0), np.maximum(high - y, 0)]
     axes.errorbar(x, y, errors, marker="o", capsize=3, zorder=2, label="measured, with 95 % interval")
-    for b, offset, side in zip(bins, cycle([(6, -14), (0, 8)]), cycle(["left", "center"]), strict=False):
-        axes.annotate(str(b.num), (b.mean_score, b.share_right), offset, textcoords="offset points", ha=side)
-    axes.set(xlabel="score", ylabel="share of poses that are right", xlim=(-0.05, 1.08), ylim=(-0.06, 1.08))
+    for b, offset in zip(bins, cycle([(6, -14), (6, 7)]), strict=False):
+        axes.annotate(str(b.num), (b.mean_score, b.share_right), offset, textcoords="offset points")
+    axes.set(xlabel="score", ylabel="share of poses that are right", xlim=(-0.05, 1.1), ylim=(-0.06, 1.09))
     axes.xaxis.set_major_formatter(PercentFormatter(1))
     axes.yaxis.set_major_formatter(PercentFormatter(1))
     axes.set_aspect("equal")

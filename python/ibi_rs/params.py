@@ -191,7 +191,10 @@ class Overlap:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """HV ``evidence``: accepts a pose if it is probably right, judged by its support.
+    """HV ``evidence``: accepts a pose if it is right with a probability of more than ``t_score``.
+
+    Judged by how unlikely it is that so many correspondences agree by chance, in this scene, and by how much
+    closer the two clouds lie than chance would put them. The verdict is given in log odds.
 
     Parameters
     ----------
@@ -245,7 +248,12 @@ _STAGES: dict[str, tuple[type[Any], ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Params:
-    """How a registration runs. The default is :meth:`paper_synthetic` with ``t_he_pr`` 3.
+    """How a registration runs.
+
+    The default is not of the paper: all correspondences play, one neighbourhood of a second-order
+    compatibility graph at a time; hypotheses are polished on the clouds, judged by how unlikely their support
+    is by chance, and compete for the scene before and after they are accepted. It is for scenes that show
+    their objects whole or nearly so; normals help where both clouds have them.
 
     A stage may be given by its word, ``Params(ce="off")``, which takes that variant's defaults.
 
@@ -262,20 +270,20 @@ class Params:
     d_op_pr
         d_op: largest distance of overlapping points, in pr; > 0.
     min_normal_cos
-        Least cosine between the normals of an inlier's two points, and of overlapping points, -1 to 1; with a
-        viewpoint, points that face away from it count in no overlap. None leaves normals out of both.
+        Least cosine between the normals of an inlier's two points, and of overlapping points, -1 to 1. None
+        leaves normals out of both.
     oriented_normals
-        Whether the normals are oriented: outwards on the source, towards the camera on the target. If not,
-        they are compared up to sign, and the viewpoint cannot tell which source points can be seen.
+        Whether the normals are oriented: outwards on the source, towards the camera on the target; then
+        points that face away from a viewpoint count in no overlap. If not, they are compared up to sign.
     t_s
         t_s: a run ends when fewer seeds than this are found; at least 3.
     scs, ce, te, hv
         The four stages: seed correspondence selection, correspondence enhancement, transformation estimation,
         hypothesis validation.
     refine
-        How a hypothesis is polished on the clouds before it is validated: ``"none"``, or ``"icp"``, iterative
-        closest points, point-to-plane where normals count; a hypothesis that fewer than ``t_s``
-        correspondences agree with afterwards is dropped.
+        How a hypothesis is polished on the clouds: ``"none"``, or ``"icp"``, iterative closest points,
+        point-to-plane where normals count. The polished one stays if its verdict is no worse, and at least
+        ``t_s`` correspondences still agree with it.
     n_contest
         A contest lasts this many rounds: at its end the hypotheses that passed validation become instances,
         best value first. 1: each at once, as it is found. At least 1.

@@ -21,13 +21,14 @@ class Pose:
     target_from_source : (4, 4) float64
         Moves source points onto this instance; acts on column vectors, translation in data units.
     score : float
-        The probability that the pose is right, judged by ``evidence`` and ``closeness``, 0 to 1; what poses
-        are ranked by.
+        The probability that the pose is right, judged by ``evidence``, ``closeness`` and ``back_fit``, 0 to 1;
+        what poses are ranked by. On a scan of one view it means little, unless normals are oriented and the
+        viewpoint is given.
     overlap : float
         Share of source points within ``d_op`` of a target point, 0 to 1.
     closeness : float
-        Mean over the visible source points of max(0, 1 - d / 2 ``d_op``), d being the distance to the nearest
-        target point that no other pose owns, 0 to 1.
+        How much closer the source lies to target points that no other pose owns than chance would put it:
+        0 as by chance, 1 perfect; below 0 if worse than by chance.
     back_fit : float
         Mean over the correspondences whose target point lies within 2 ``d_op`` of this instance, and belongs
         to no other pose, of 1 - d / 2 ``d_op``, d being that distance, 0 to 1.

@@ -33,12 +33,6 @@ use ibi_testkit::scenes::{Recipe, Scene};
 /// Sizes of published benchmarks lie in between.
 const SIZES: [usize; 3] = [1000, 5000, 20_000];
 
-/// The largest size a variant is timed at. `local_gtm` took 0.9 s for three selections at 5000 and 70 s at 20,000
-/// (two shared cores, Nov 2026): too long to bench, and to be lifted when that is mended.
-fn largest(variant: &str) -> usize {
-    if variant == "local_gtm" { 5000 } else { usize::MAX }
-}
-
 /// The scene of all stage benches: five instances, half of the correspondences wrong.
 fn scene(num_correspondences: usize) -> Scene {
     Recipe::sized(num_correspondences, 0.5, 5).build()
@@ -85,7 +79,7 @@ fn bench_stage<P: 'static>(
     prepare: impl Fn(&Context<'_>) -> P + Clone + Send + Sync + 'static,
     work: impl Fn(&Context<'_>, &P) -> bool + Clone + Send + Sync + 'static,
 ) {
-    for size in SIZES.into_iter().filter(|&size| size <= largest(variant)) {
+    for size in SIZES {
         let scene = scene(size);
         group.bench_function(BenchmarkId::new(variant, size), |b| {
             b.iter_custom(|iterations| {

@@ -416,6 +416,12 @@ fn single_view_with_gsac_finds_every_instance_whatever_the_threads() {
     check_single_view(&Params { te: Gsac::default().into(), ..Params::single_view() });
 }
 
+/// The default preset, told that normals are oriented, judges by what the camera sees.
+#[test]
+fn default_with_oriented_normals_finds_every_instance_whatever_the_threads() {
+    check_single_view(&Params { oriented_normals: true, ..Params::default() });
+}
+
 #[test]
 fn finish_accepts_every_candidate_that_still_passes() {
     // The last is far below the best, so that one settling leaves it for a contest that never comes.

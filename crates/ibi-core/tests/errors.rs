@@ -4,7 +4,7 @@
 use ibi_core::kernels::compatibility::Payoff;
 use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::stages::ce::Voting;
-use ibi_core::stages::hv::{InlierCount, Overlap};
+use ibi_core::stages::hv::{Evidence, InlierCount, Overlap};
 use ibi_core::stages::scs::Gtm;
 use ibi_core::stages::te::{Gsac, Ransac};
 use ibi_core::{Argument, Cloud, Correspondences, Error, Params, Registrar, Registration, StopReason};
@@ -309,10 +309,20 @@ fn bad_params() -> Vec<BadParam> {
             x,
             SHARE,
         ));
+        all.push(bad(
+            move |p| p.hv = Evidence { t_score: x, ..Evidence::default() }.into(),
+            "hv.t_score",
+            x,
+            SHARE,
+        ));
     }
     for x in [-1.0, 2e9, f64::NAN, f64::INFINITY] {
         all.push(bad(move |p| p.timeout_s = Some(x), "timeout_s", x, SECONDS));
     }
+    for x in [-1.1, 1.1, f64::NAN] {
+        all.push(bad(move |p| p.min_normal_cos = Some(x), "min_normal_cos", x, "between -1 and 1"));
+    }
+    all.push(bad(|p| p.n_contest = 0, "n_contest", 0.0, "at least 1"));
     for n in 0..3 {
         let gtm = move |p: &mut Params| p.scs = Gtm { n_downsample: n, ..Gtm::default() }.into();
         all.push(bad(move |p| p.t_s = n, "t_s", n.into(), "at least 3"));
@@ -342,7 +352,8 @@ fn parameters_must_be_in_range() {
         let error = Error::Param { name, value, allowed };
         assert_fails(&input, &error, &format!("params.{name} is {value}; it must be {allowed}"));
     }
-    for preset in [Params::default(), Params::paper_synthetic(), Params::paper_real()] {
+    for preset in [Params::default(), Params::paper_synthetic(), Params::paper_real(), Params::single_view()]
+    {
         assert_eq!(preset.validate(), Ok(()));
     }
 }
@@ -371,7 +382,10 @@ fn the_ends_of_the_ranges_are_legal() {
         |p| p.te = Ransac { n_ransac: 1, min_height_pr: 0.0 }.into(),
         |p| p.hv = Overlap { t_overlap: 0.0, ..Overlap::default() }.into(),
         |p| p.hv = Overlap { t_overlap: 1.0, ..Overlap::default() }.into(),
+        |p| p.hv = Evidence { t_score: 0.0, ..Evidence::default() }.into(),
+        |p| p.hv = Evidence { t_score: 1.0, ..Evidence::default() }.into(),
         |p| p.hv = InlierCount { t_inliers: u32::MAX }.into(),
+        |p| p.n_contest = u32::MAX,
         |p| p.max_rounds = Some(u32::MAX),
         |p| p.max_instances = Some(u32::MAX),
     ];

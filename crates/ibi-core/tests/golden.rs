@@ -40,6 +40,25 @@ fn paper(n_vot: u32) -> Value {
     })
 }
 
+/// What `Params::default()` was when the file was written.
+fn evidence() -> Value {
+    json!({
+        "delta_r_pr": 1.0,
+        "t_he_pr": 1.5,
+        "d_op_pr": 1.5,
+        "t_s": 4,
+        "scs": { "variant": "local_gtm", "tau_pr": 1.0, "min_length_pr": 1.0, "second_order": true, "n_gtm": 20 },
+        "ce": { "variant": "voting", "n_vot": 300 },
+        "te": { "variant": "irls", "n_refits": 4 },
+        "hv": { "variant": "evidence", "t_score": 0.5, "exclusive": true },
+        "refine": "icp",
+        "n_contest": 60,
+        "joint_check": true,
+        "removal": "inliers",
+        "max_rejections": 60
+    })
+}
+
 /// `base` with the entries of `other` in the place of its own.
 fn with(mut base: Value, other: Value) -> Value {
     let Value::Object(other) = other else { panic!("not an object") };
@@ -59,6 +78,7 @@ fn cases() -> Vec<(Scene, Value)> {
         (recipe("four_instances", 12, 4, 100), paper(70)),
         (recipe("offset_1e5", 13, 3, 120).offset(1e5), paper(70)),
         (recipe("millimetres", 15, 3, 120).scaled(1000.0), paper(70)),
+        (recipe("evidence", 17, 3, 200), evidence()),
         // Its instances are there, but no correspondence says so.
         (Scene { truth: Vec::new(), ..nothing.build() }, paper(70)),
         (
