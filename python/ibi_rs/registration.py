@@ -21,8 +21,8 @@ class Pose:
     target_from_source : (4, 4) float64
         Moves source points onto this instance; acts on column vectors, translation in data units.
     score : float
-        The probability that the pose is right, judged by ``evidence``, ``closeness`` and ``back_fit``, 0 to 1;
-        what poses are ranked by. On a scan of one view it means little, unless normals are oriented and the
+        The probability that the pose is right, 0 to 1, by ``evidence``, ``closeness`` and ``back_fit``; what
+        poses are ranked by. On a scan of one view it means little, unless normals are oriented and the
         viewpoint is given.
     overlap : float
         Share of source points within ``d_op`` of a target point, 0 to 1.
