@@ -30,12 +30,12 @@ pub struct Registration {
 pub struct Pose {
     /// Moves source points onto this instance; data units.
     pub target_from_source: Isometry3<f64>,
-    /// The probability that the pose is right, judged by `evidence` and `closeness`; what poses are ranked by.
+    /// The probability that the pose is right, by `evidence`, `closeness` and `back_fit`; what poses are ranked by.
     pub score: f64,
     /// Share of source points within `d_op` of a target point, 0 to 1.
     pub overlap: f64,
-    /// Mean over the visible source points of max(0, 1 - d / 2 `d_op`), d being the distance to the nearest target
-    /// point that no other pose owns, 0 to 1.
+    /// How much closer the source lies to the target than chance would have it: 1 for a perfect fit, 0 for one as by
+    /// chance. See [`crate::kernels::evidence::Support::closeness`].
     pub closeness: f64,
     /// Mean over the correspondences whose target point lies within 2 `d_op` of this instance, and of no other
     /// pose, of 1 - d / 2 `d_op`, d being that distance, 0 to 1.
