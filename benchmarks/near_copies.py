@@ -7,8 +7,7 @@ centred in the unit sphere, as the layouts have them.
 
 Below 0.08 radii two shapes count as near-copies. There is no gap in the values to put the threshold in. It is
 about the spacing of the 256 points that stand for a shape in the ECC layout (0.07 radii on average): to the
-nearest points of two samples such shapes are one. In 80 ECC scenes half of the pairs below it that met gave
-false poses, up to three a scene; of those above it a fifth did, no oftener at 0.09 than at 0.16.
+nearest points of two samples such shapes are one.
 
     python benchmarks/near_copies.py examples/models     # prints the closest, writes like into its index.json
 """

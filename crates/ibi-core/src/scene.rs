@@ -75,7 +75,7 @@ pub struct PreparedCloud<'a> {
     /// Centre of the bounding box; no point is farther from it than half the extent.
     pub centre: Point3<f64>,
     /// A few points that stand for all, where a mean over the cloud is wanted: [`PROBE_POINTS`] drawn at random.
-    pub(crate) probe: Probe,
+    probe: Probe,
     /// Fewer still, for a first glance.
     scout: Probe,
     diameter: OnceLock<f64>,
@@ -145,7 +145,7 @@ const SCOUT_POINTS: usize = 64;
 
 /// Points drawn from a cloud, with their normals.
 #[derive(Debug)]
-pub(crate) struct Probe {
+struct Probe {
     points: Vec<Point3<f64>>,
     normals: Option<Vec<Vector3<f64>>>,
 }
@@ -218,8 +218,7 @@ impl Scene<'_> {
     /// The fit of the moved source to the target points that are not `claimed`, within a reach of 2 `d_op`.
     #[must_use]
     pub fn fit(&self, params: &Params, target_from_source: &Isometry3<f64>, claimed: Option<&[bool]>) -> f64 {
-        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-        let source = self.source.probe.surface(params.min_normal_cos.is_some());
+        let (source, target, contact) = self.probed(params, &self.source.probe);
         fit(&source, &target, &self.target.neighbors, target_from_source, &contact, claimed)
     }
 
@@ -260,19 +259,19 @@ impl Scene<'_> {
         if self.is_one_sided(params) {
             return false;
         }
-        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-        let source = self.source.scout.surface(params.min_normal_cos.is_some());
+        let (source, target, contact) = self.probed(params, &self.source.scout);
         fit(&source, &target, &self.target.neighbors, target_from_source, &contact, None) < HOPELESS
     }
 
     /// The pose polished on the two clouds by ICP within 2 `d_op`.
     #[must_use]
     pub fn icp(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
-        let (mut source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
         // From one side few points are seen, and they are needed all.
-        if !self.is_one_sided(params) {
-            source = self.source.probe.surface(params.min_normal_cos.is_some());
-        }
+        let (source, target, contact) = if self.is_one_sided(params) {
+            self.surfaces(params, 2.0 * params.d_op_pr)
+        } else {
+            self.probed(params, &self.source.probe)
+        };
         icp(&source, &target, &self.target.neighbors, target_from_source, &contact, ICP_STEPS)
     }
 
@@ -280,6 +279,12 @@ impl Scene<'_> {
     pub(crate) fn is_one_sided(&self, params: &Params) -> bool {
         let with_normals = params.min_normal_cos.is_some() && self.source.normals.is_some();
         with_normals && params.oriented_normals && self.target.viewpoint.is_some()
+    }
+
+    /// A few source points against the target within a reach of 2 `d_op`.
+    fn probed<'p>(&'p self, params: &Params, probe: &'p Probe) -> (Surface<'p>, Surface<'p>, Contact) {
+        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        (probe.surface(params.min_normal_cos.is_some()), target, contact)
     }
 
     fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact) {

@@ -6,15 +6,18 @@
     reason = "tests may panic, and compare what is exact"
 )]
 
+#[path = "common/oriented.rs"]
+mod oriented;
+
 use ibi_core::kernels::evidence::Support;
 use ibi_core::kernels::neighbors::Neighbors;
-use ibi_core::kernels::overlap::{Contact, Surface, chance_fit, fit, overlap, places};
+use ibi_core::kernels::overlap::{Contact, chance_fit, fit, overlap, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::kernels::rng::Rng;
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_testkit::naive;
-use ibi_testkit::scenes::asymmetric_model;
 use ibi_testkit::strategies::{point, points, rigid_motions};
+use oriented::{Oriented, clouds};
 use proptest::prelude::*;
 
 // ----------------------------------------------------------------------------------------------------- support
@@ -107,26 +110,7 @@ fn nothing_speaks_for_a_pose_that_nothing_agrees_with() {
 
 // --------------------------------------------------------------------------------------------------------- fit
 
-/// A cloud with normals.
-#[derive(Debug, Clone, Default)]
-struct Oriented {
-    points: Vec<Point3<f64>>,
-    normals: Vec<Vector3<f64>>,
-}
-
 impl Oriented {
-    fn model(num_points: usize) -> Self {
-        let points = asymmetric_model(num_points);
-        Self { normals: naive::outward_normals(&points), points }
-    }
-
-    fn moved(&self, pose: &Isometry3<f64>) -> Self {
-        Self {
-            points: self.points.iter().map(|p| pose * p).collect(),
-            normals: self.normals.iter().map(|n| pose * n).collect(),
-        }
-    }
-
     /// The first `kept`, and all of `other`.
     fn joined(&self, kept: usize, other: &Self) -> Self {
         let kept = kept.min(self.points.len());
@@ -142,21 +126,9 @@ impl Oriented {
         Self { normals: self.normals.iter().zip(flips.iter().cycle()).map(flip).collect(), ..self.clone() }
     }
 
-    fn surface(&self, with_normals: bool) -> Surface<'_> {
-        Surface { points: &self.points, normals: with_normals.then_some(&self.normals) }
-    }
-
     fn naive(&self, with_normals: bool) -> naive::Surface<'_> {
         (&self.points, with_normals.then_some(&self.normals))
     }
-}
-
-/// Clouds with normals that have nothing to do with the points.
-fn clouds(count: std::ops::Range<usize>) -> impl Strategy<Value = Oriented> {
-    prop::collection::vec((point(), rigid_motions(1.0)), count).prop_map(|rows| {
-        let (points, normals) = rows.into_iter().map(|(p, turn)| (p, turn * Vector3::z())).unzip();
-        Oriented { points, normals }
-    })
 }
 
 fn contact(distance: f64, oriented: bool) -> Contact {

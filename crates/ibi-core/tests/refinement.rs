@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::float_cmp, reason = "tests may panic")]
 
 mod common;
+#[path = "common/oriented.rs"]
+mod oriented;
 
 use common::Mock;
 use ibi_core::kernels::icp::icp;
@@ -19,40 +21,8 @@ use ibi_testkit::Rng;
 use ibi_testkit::naive;
 use ibi_testkit::scenes::asymmetric_model;
 use ibi_testkit::strategies::{points, rigid_motions};
+use oriented::{Oriented, clouds};
 use proptest::prelude::*;
-
-/// A cloud with normals.
-#[derive(Debug, Clone)]
-struct Oriented {
-    points: Vec<Point3<f64>>,
-    normals: Vec<Vector3<f64>>,
-}
-
-impl Oriented {
-    fn model(num_points: usize) -> Self {
-        let points = asymmetric_model(num_points);
-        Self { normals: naive::outward_normals(&points), points }
-    }
-
-    fn moved(&self, pose: &Isometry3<f64>) -> Self {
-        Self {
-            points: self.points.iter().map(|p| pose * p).collect(),
-            normals: self.normals.iter().map(|n| pose * n).collect(),
-        }
-    }
-
-    fn surface(&self, oriented: bool) -> Surface<'_> {
-        Surface { points: &self.points, normals: oriented.then_some(&self.normals) }
-    }
-}
-
-/// Clouds with normals that have nothing to do with the points.
-fn clouds(count: std::ops::Range<usize>) -> impl Strategy<Value = Oriented> {
-    prop::collection::vec((ibi_testkit::strategies::point(), rigid_motions(1.0)), count).prop_map(|rows| {
-        let (points, normals) = rows.into_iter().map(|(p, turn)| (p, turn * Vector3::z())).unzip();
-        Oriented { points, normals }
-    })
-}
 
 fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact {
     Contact { distance, min_normal_cos: 0.5, oriented: true, viewpoint }

@@ -62,11 +62,11 @@ impl Support {
     }
 }
 
-/// Weights of 1, ln(1 + evidence), closeness and `back_fit` in the log odds: a logistic regression over the poses that
-/// runs with a threshold near 0 return, right and wrong, on the tuning half of the benchmark layouts (2000 poses; half
-/// of the instances of some cut off by a plane).
+/// Weights of 1, ln(1 + evidence), closeness and `back_fit` in the log odds: a logistic regression over the poses, right
+/// and wrong, that runs with a threshold near 0 return on the tuning half of the benchmark layouts, in some of which a
+/// part of each object is cut off by a plane. `benchmarks/calibration.py --fit` fits them anew.
 const WHOLE: [f64; 4] = [-26.8, 1.27, 17.45, 18.75];
 
-/// The same from five real scans of two parts (79 poses): a rough guide. Sensor noise and hidden points leave less to
-/// be close to, and scenes of parts heaped on each other say nothing by their `back_fit`.
+/// The same from five real scans of two parts, of which three are shipped (79 poses): a rough guide. Sensor noise and
+/// hidden points leave less to be close to, and scenes of parts heaped on each other say nothing by their `back_fit`.
 const ONE_SIDED: [f64; 4] = [-3.2, 0.5, 19.0, 0.0];

@@ -86,26 +86,33 @@ impl Context<'_> {
         let ids = self.alive.ids();
         let close = close_pairs(self.alive.columns(), target_from_source, distance_pr);
         let close = close.into_iter().map(|row| ids[row as usize]);
-        match (&self.pairs.normals, self.params.min_normal_cos) {
-            (Some(normals), Some(min_cos)) => {
-                close.filter(|&id| normals.agree(id, target_from_source, min_cos)).collect()
-            }
-            _ => close.collect(),
-        }
+        close.filter(|&id| self.normals_agree(id, target_from_source)).collect()
     }
 
     /// Alive correspondences that an accepted pose uses up: its inliers within 2 `t_he`, and those, right or
     /// wrong, whose target point it explains.
     #[must_use]
     pub fn spent(&self, target_from_source: &Isometry3<f64>) -> Vec<u32> {
-        let ids = self.alive.ids();
-        let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
-        let explained = self.scene.nearest_source(self.params.d_op_pr, target_from_source, &targets);
         let mut spent = self.inliers(target_from_source, 2.0 * self.params.t_he_pr);
-        spent.extend(ids.iter().zip(explained).filter(|(_, by)| by.is_some()).map(|(&id, _)| id));
+        spent.extend(self.near(self.params.d_op_pr, target_from_source).map(|(id, ..)| id));
         spent.sort_unstable();
         spent.dedup();
         spent
+    }
+
+    /// Alive correspondences whose target point lies within `distance_pr` of the moved source, ascending, each with
+    /// the row of the nearest source point and the distance in data units.
+    fn near(
+        &self,
+        distance_pr: f64,
+        target_from_source: &Isometry3<f64>,
+    ) -> impl Iterator<Item = (u32, u32, f64)> {
+        let ids = self.alive.ids();
+        let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
+        let nearest = self.scene.nearest_source(distance_pr, target_from_source, &targets);
+        ids.iter()
+            .zip(nearest)
+            .filter_map(|(&id, nearest)| nearest.map(|(row, distance)| (id, row, distance)))
     }
 
     /// What speaks for a pose: the alive correspondences, and the scene points, if `exclusive` only those that no
@@ -114,15 +121,11 @@ impl Context<'_> {
     pub fn support(&self, target_from_source: &Isometry3<f64>, exclusive: bool) -> Support {
         let t_he = self.length(self.params.t_he_pr);
         let chance = self.chance();
-        let ids = self.alive.ids();
-        let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
         let reach_pr = 2.0 * self.params.d_op_pr;
         let (reach, d_op) = (self.length(reach_pr), self.length(self.params.d_op_pr));
-        let nearest = self.scene.nearest_source(reach_pr, target_from_source, &targets);
         let (mut num_explained, mut num_agreeing, mut expected) = (0, 0, 0.0);
         let (mut num_near, mut back_fit) = (0, 0.0);
-        for (&id, nearest) in ids.iter().zip(nearest) {
-            let Some((row, distance)) = nearest else { continue };
+        for (id, row, distance) in self.near(reach_pr, target_from_source) {
             num_near += 1;
             back_fit += 1.0 - distance / reach;
             if distance > d_op {
@@ -130,11 +133,9 @@ impl Context<'_> {
             }
             num_explained += 1;
             expected += f64::from(chance.agreement[row as usize]);
-            let id = id as usize;
-            let residual_sq =
-                (target_from_source * self.pairs.source[id] - self.pairs.target[id]).norm_squared();
-            num_agreeing +=
-                u32::from(residual_sq < t_he * t_he && self.normals_agree(id as u32, target_from_source));
+            let (p, q) = (self.pairs.source[id as usize], self.pairs.target[id as usize]);
+            let is_close = (target_from_source * p - q).norm_squared() < t_he * t_he;
+            num_agreeing += u32::from(is_close && self.normals_agree(id, target_from_source));
         }
         let fit = self.scene.fit(self.params, target_from_source, exclusive.then_some(self.claimed));
         Support {
