@@ -392,7 +392,7 @@ def described(points, normals):
     return np.hstack([points, 0.1 * normals])
 
 
-@pytest.mark.parametrize("seed", [2, 5])
+@pytest.mark.parametrize("seed", [5, 7])
 def test_the_joint_check_drops_poses_that_live_on_what_others_own(seed):
     """Almost everything is accepted, at once: wrong early poses, which the right ones then take apart."""
     scene = ibi.synth.ecc_layout(seed, shapes=SHAPES, descriptors=described, descriptor_noise=0.3)
@@ -576,7 +576,7 @@ def test_a_stopped_run_keeps_what_the_full_run_found_first():
 def test_a_stopped_contest_keeps_the_best_of_what_it_has():
     """Also where the run ends before its first contest does."""
     for limit in (2, 5, 20):
-        found = register(PLAIN.replace(max_rounds=limit))
+        found = register(PLAIN.replace(max_rounds=limit, hv=ibi.Evidence(t_sure=1)))  # none is sure enough
         assert len(found.rounds) == limit
         assert 1 <= len(found) <= limit
         assert all(pose.round < limit for pose in found)

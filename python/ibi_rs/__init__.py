@@ -5,7 +5,7 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 
 from ibi_rs import metrics, plot, synth
 from ibi_rs._core import InputError, ParamsError, __version__
-from ibi_rs._register import register
+from ibi_rs._register import Model, register
 from ibi_rs.params import (
     Evidence,
     Gsac,
@@ -30,6 +30,7 @@ __all__ = [
     "InputError",
     "Irls",
     "LocalGtm",
+    "Model",
     "None_",
     "Off",
     "Overlap",

@@ -1,7 +1,7 @@
 """The extension module, written in Rust in ``crates/ibi-py``. Users call the faces in front of it."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +9,7 @@ import numpy.typing as npt
 __all__ = [
     "InputError",
     "ParamsError",
+    "Source",
     "__version__",
     "check_params",
     "metrics_add",
@@ -49,13 +50,22 @@ def params_from_toml(text: str) -> str: ...
 
 # Registration.
 
+@final
+class Source:
+    """A source that was checked and prepared."""
+
+    def __new__(cls, points: _Floats, normals: _Floats | None = None) -> Source: ...
+    @property
+    def spacing(self) -> float: ...
+    @property
+    def diameter(self) -> float: ...
+
 def register(
-    src: _Floats,
+    source: Source,
     tgt: _Floats,
     corr: npt.NDArray[Any],  # (M, 2) int64 or (M, 6) float64
     params: str,
     *,
-    src_normals: _Floats | None = None,
     tgt_normals: _Floats | None = None,
     similarity: _Floats | None = None,
     viewpoint: Sequence[float] | None = None,

@@ -97,27 +97,134 @@ def register(
     >>> found[0].target_from_source.shape
     (4, 4)
     """
-    params = params if params is not None else Params()
-    if not isinstance(params, Params):
-        raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be callable, not {type(callback).__name__}")
-    overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
-    params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
-
-    raw = _core.register(
-        _points("src", src),
-        _points("tgt", tgt),
-        _correspondences(corr),
-        json.dumps(params.to_dict()),
-        src_normals=None if src_normals is None else _points("src_normals", src_normals),
-        tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
-        similarity=None if similarity is None else _vector("similarity", similarity),
-        viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
-        num_threads=_num_threads(num_threads),
-        on_round=None if callback is None else _on_round(callback),
+    model = Model(src, normals=src_normals)
+    return model.register(
+        tgt,
+        corr,
+        params,
+        tgt_normals=tgt_normals,
+        similarity=similarity,
+        viewpoint=viewpoint,
+        num_threads=num_threads,
+        max_instances=max_instances,
+        timeout_s=timeout_s,
+        callback=callback,
     )
-    return _registration(raw, params)
+
+
+class Model:
+    """A model (source), checked and prepared once, to be found in any number of scenes.
+
+    Its spacing and diameter are measured once; :func:`register` measures them anew with every call. A model can be
+    pickled, and shared by threads.
+
+    Parameters
+    ----------
+    src : (N, 3) array_like
+        The model, as in :func:`register`.
+    normals : (N, 3) array_like, optional
+        Its normals; any length but 0.
+
+    Raises
+    ------
+    InputError
+        As :func:`register`, of ``src`` and ``src_normals``.
+    TypeError
+        As :func:`register`.
+
+    Examples
+    --------
+    >>> import ibi_rs as ibi
+    >>> scene = ibi.synth.outlier_layout(seed=1, num_instances=5)
+    >>> model = ibi.Model(scene.src)
+    >>> len(model.register(scene.tgt, scene.corr))
+    5
+    """
+
+    def __init__(self, src: Points, *, normals: npt.ArrayLike | None = None) -> None:
+        points = _points("src", src)
+        of_points = None if normals is None else _points("src_normals", normals)
+        self._source = _core.Source(points, of_points)
+        # Copies: the caller's arrays may change, the prepared source does not.
+        self._points, self._normals = _frozen(points), None if of_points is None else _frozen(of_points)
+
+    @property
+    def points(self) -> npt.NDArray[np.float64]:
+        """(N, 3), in data units; read-only."""
+        return self._points
+
+    @property
+    def normals(self) -> npt.NDArray[np.float64] | None:
+        """(N, 3) as given, or None; read-only."""
+        return self._normals
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance of a point to its nearest other point, in data units."""
+        return self._source.spacing
+
+    @property
+    def diameter(self) -> float:
+        """Largest distance of two points, in data units; measured when first asked for, or by the first run."""
+        return self._source.diameter
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def __repr__(self) -> str:
+        normals = "with" if self._normals is not None else "without"
+        return f"Model({len(self)} points, {normals} normals, spacing {self.spacing:.4g})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"points": self._points, "normals": self._normals}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        Model.__init__(self, state["points"], normals=state["normals"])
+
+    def register(
+        self,
+        tgt: Points,
+        corr: Any,
+        params: Params | None = None,
+        *,
+        tgt_normals: npt.ArrayLike | None = None,
+        similarity: npt.ArrayLike | None = None,
+        viewpoint: npt.ArrayLike | None = None,
+        num_threads: int | None = None,
+        max_instances: int | None = None,
+        timeout_s: float | None = None,
+        callback: Callable[[Round], object] | None = None,
+    ) -> Registration:
+        """Find every instance of this model in a scene: :func:`register` without the model's arguments.
+
+        Parameters, returns, raises: those of :func:`register`.
+        """
+        params = params if params is not None else Params()
+        if not isinstance(params, Params):
+            raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+        if callback is not None and not callable(callback):
+            raise TypeError(f"callback must be callable, not {type(callback).__name__}")
+        overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
+        params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
+
+        raw = _core.register(
+            self._source,
+            _points("tgt", tgt),
+            _correspondences(corr),
+            json.dumps(params.to_dict()),
+            tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
+            similarity=None if similarity is None else _vector("similarity", similarity),
+            viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
+            num_threads=_num_threads(num_threads),
+            on_round=None if callback is None else _on_round(callback),
+        )
+        return _registration(raw, params)
+
+
+def _frozen(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    copy = array.copy()
+    copy.flags.writeable = False
+    return copy
 
 
 def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:

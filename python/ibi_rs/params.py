@@ -65,6 +65,10 @@ class LocalGtm:
         With normals: how far the angles between two oriented points may differ, in cosine; > 0.
     second_order
         Whether an edge is weighed by what its two ends have in common, or by its own rigidity alone.
+    max_degree
+        Where correspondences have more compatible ones than this around them, only so many of them take part that
+        they have about as many; at least 8. Bounds time and memory, and keeps those down that are compatible with
+        all and sundry.
     n_gtm
         N_gtm: generations of the replicator; at least 1.
 
@@ -75,10 +79,11 @@ class LocalGtm:
     """
 
     variant: ClassVar[str] = "local_gtm"
-    tau_pr: float = 1.0
+    tau_pr: float = 0.9
     min_length_pr: float = 1.0
     normal_tolerance: float = 0.5
     second_order: bool = True
+    max_degree: int = 80
     n_gtm: int = 20
 
 
@@ -200,6 +205,9 @@ class Evidence:
     ----------
     t_score
         The probability to exceed, 0 to 1.
+    t_sure
+        A pose that is right with a probability of more than this becomes an instance at once; the others wait for
+        the end of the contest. 0 to 1; 1: all wait.
     exclusive
         Whether target points that an accepted instance explains support no later one, so that an instance is
         found once.
@@ -207,6 +215,7 @@ class Evidence:
 
     variant: ClassVar[str] = "evidence"
     t_score: float = 0.5
+    t_sure: float = 0.99
     exclusive: bool = True
 
 

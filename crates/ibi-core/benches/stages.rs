@@ -13,14 +13,17 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use ibi_core::kernels::by_target::ByTarget;
 use ibi_core::kernels::columns::Columns;
 use ibi_core::kernels::compatibility::{self, Payoff, votes};
+use ibi_core::kernels::graph::{EdgeTest, Graph};
 use ibi_core::kernels::kabsch::rigid_fit;
 use ibi_core::kernels::mae::mae;
+use ibi_core::kernels::nearby::{Nearby, mean_spacing};
 use ibi_core::kernels::neighbors::Neighbors;
 use ibi_core::kernels::otsu::otsu;
 use ibi_core::kernels::overlap::{Contact, Surface, overlap, places};
-use ibi_core::kernels::replicator::replicator;
+use ibi_core::kernels::replicator::{Payoffs, replicator};
 use ibi_core::kernels::triplets::TopTriplets;
 use ibi_core::stages::ce::Ce;
 use ibi_core::stages::hv::Hv;
@@ -154,7 +157,7 @@ fn hv(c: &mut Criterion) {
 }
 
 /// The kernel's matrix, never interrupted.
-fn payoff_matrix(pairs: &Columns, payoff: Payoff, delta_r: f64) -> Vec<f32> {
+fn payoff_matrix(pairs: &Columns, payoff: Payoff, delta_r: f64) -> Payoffs {
     compatibility::payoff_matrix(pairs, payoff, delta_r, || false)
 }
 
@@ -167,15 +170,17 @@ fn kernels(c: &mut Criterion) {
     let all = Columns::new(&source, &target, pr);
     let sample = all.gather(&(0..1024).collect::<Vec<_>>());
     let payoff = payoff_matrix(&sample, Payoff::Gaussian, 10.0);
-    let population = replicator(&payoff, 1024, 20, || false).unwrap();
+    let population = replicator(&payoff, 20, || false).unwrap();
     let scores: Vec<f32> = (0..300).map(|i| 300.0 - i as f32).collect();
     let tree = Neighbors::new(&scene.target);
+    let near = Nearby::new(&scene.target, 0.3);
     let pose = scene.truth[0];
 
     settings(c, "kernel", |group| {
         for kind in [Payoff::Gaussian, Payoff::Ratio] {
             let name = format!("payoff_matrix_{kind:?}").to_lowercase();
-            assert!(payoff_matrix(&sample, kind, 10.0).iter().all(|x| (0.0..=1.000_001).contains(x)));
+            let matrix = payoff_matrix(&sample, kind, 10.0);
+            assert!((0..1024).all(|i| matrix.row(i).iter().all(|x| (0.0..=1.000_001).contains(x))));
             group.bench_function(BenchmarkId::new(name, 1024), |b| {
                 b.iter(|| payoff_matrix(black_box(&sample), kind, 10.0));
             });
@@ -186,7 +191,7 @@ fn kernels(c: &mut Criterion) {
 
         assert!((population.iter().sum::<f32>() - 1.0).abs() < 1e-4);
         group.bench_function("replicator/1024x20", |b| {
-            b.iter(|| replicator(black_box(&payoff), 1024, 20, || false));
+            b.iter(|| replicator(black_box(&payoff), 20, || false));
         });
 
         assert!(otsu(&population, 100).is_some());
@@ -204,7 +209,7 @@ fn kernels(c: &mut Criterion) {
         let bare = |points| Surface { points, normals: None };
         let contact = Contact { distance: 0.15, min_normal_cos: 0.0, oriented: true, viewpoint: None };
         let (model, whole) = (bare(&scene.source), bare(&scene.target));
-        let share = || overlap(&places(&model, &whole, &tree, black_box(&pose), &contact));
+        let share = || overlap(&places(&model, &whole, &near, black_box(&pose), &contact));
         let full = share();
         assert!(full > 0.999, "{full}");
         group.bench_function(BenchmarkId::new("overlap", scene.source.len()), |b| {
@@ -218,6 +223,34 @@ fn kernels(c: &mut Criterion) {
         group.bench_function(BenchmarkId::new("neighbors_query", scene.target.len()), |b| {
             b.iter(|| tree.nearest(black_box(&source[0])));
         });
+
+        group.bench_function(BenchmarkId::new("nearby_build", scene.target.len()), |b| {
+            b.iter(|| Nearby::new(black_box(&scene.target), 0.3));
+        });
+        assert_eq!(near.nearest(&scene.target[7]), Some(7));
+        group.bench_function(BenchmarkId::new("nearby_query", scene.target.len()), |b| {
+            b.iter(|| near.nearest(black_box(&source[0])));
+        });
+        let spacing = mean_spacing(&scene.target);
+        assert!(spacing > 0.0);
+        group.bench_function(BenchmarkId::new("mean_spacing", scene.target.len()), |b| {
+            b.iter(|| mean_spacing(black_box(&scene.target)));
+        });
+
+        let test = EdgeTest {
+            tau: 0.9,
+            min_length: 1.0,
+            max_length: 30.0,
+            normal_tolerance: 0.5,
+            second_order: true,
+            max_degree: 80,
+        };
+        let graph = || Graph::new(black_box(&all), None, &test, || false);
+        assert!(graph().len() > 1000);
+        group.bench_function("graph/5000", |b| b.iter(graph));
+        let by_target = ByTarget::new(&all);
+        assert!(by_target.close_pairs(&pose, 1.5).len() >= 500);
+        group.bench_function("close_pairs/5000", |b| b.iter(|| by_target.close_pairs(black_box(&pose), 1.5)));
 
         let triplet = [0, 40, 80].map(|i| (scene.source[i], pose * scene.source[i]));
         let fit = || rigid_fit(black_box(&triplet).iter().map(|(p, q)| (p, q)));

@@ -1,11 +1,13 @@
 //! Putative correspondences, and which of them are still alive.
 
+use std::sync::{Arc, OnceLock};
+
 use nalgebra::{Point3, Vector3};
 
 use crate::error::{Argument, Error};
+use crate::kernels::by_target::ByTarget;
 use crate::kernels::columns::Columns;
 use crate::kernels::graph::{PairNormals, up_to_sign};
-use crate::kernels::par;
 use crate::params::Params;
 use crate::scene::{PreparedCloud, Scene, check_points};
 
@@ -49,7 +51,7 @@ impl Correspondences {
         let side = |cloud: &PreparedCloud<'_>, column: usize| match &self.pairs {
             Pairs::Rows(rows) => rows.iter().map(|row| row[column] as u32).collect(),
             Pairs::Points(points) => {
-                let nearest = |pair: &[Point3<f64>; 2]| cloud.neighbors.nearest(&pair[column]);
+                let nearest = |pair: &[Point3<f64>; 2]| cloud.tree().nearest(&pair[column]);
                 points.iter().filter_map(nearest).map(|(row, _)| row).collect()
             }
         };
@@ -84,7 +86,9 @@ pub struct PointPairs {
     /// Row of the target point, or of the one nearest to q_i.
     pub target_rows: Vec<u32>,
     /// The same pairs as centred `f32` columns in multiples of the resolution.
-    pub columns: Columns,
+    pub columns: Arc<Columns>,
+    /// The same columns sorted by the place of the target point.
+    pub by_target: ByTarget,
     /// How alike the two descriptors of each pair are; larger is better.
     pub similarity: Option<Vec<f64>>,
     /// Normals at both points of each pair.
@@ -107,7 +111,8 @@ impl PointPairs {
         check_points(&source, Argument::Corr)?;
         check_points(&target, Argument::Corr)?;
         let (source_rows, target_rows) = given.rows(scene);
-        let columns = Columns::new(&source, &target, scene.resolution);
+        let columns = Arc::new(Columns::new(&source, &target, scene.resolution));
+        let by_target = ByTarget::new(&columns);
         let normals = scene.source.normals.as_ref().zip(scene.target.normals.as_ref()).map(|(s, t)| {
             let look_up = |normals: &[Vector3<f64>], rows: &[u32]| {
                 rows.iter().map(|&row| normals[row as usize].cast()).collect()
@@ -115,7 +120,7 @@ impl PointPairs {
             PairNormals { source: look_up(s, &source_rows), target: look_up(t, &target_rows), oriented }
         });
         let similarity = given.similarity.clone();
-        Ok(Self { source, target, source_rows, target_rows, columns, similarity, normals })
+        Ok(Self { source, target, source_rows, target_rows, columns, by_target, similarity, normals })
     }
 
     /// For each source point the share of the correspondences whose source point lies within `t_he` of it (and
@@ -135,10 +140,10 @@ impl PointPairs {
                     up_to_sign(n[row].dot(&n[other as usize]), params.oriented_normals) >= min_cos
                 })
             };
-            let near = source.neighbors.within(&source.points[row], t_he).filter(alike);
+            let near = scene.near_source.within(&source.points[row], t_he).filter(alike);
             near.map(|other| uses[other as usize]).sum::<u32>() as f32 / self.len().max(1) as f32
         };
-        par::map(source.points.len(), 64, chance)
+        (0..source.points.len()).map(chance).collect()
     }
 
     /// M, the number of correspondences.
@@ -194,41 +199,68 @@ fn check_similarity(similarity: &[f64], expected: usize) -> Result<(), Error> {
 /// The correspondences that no round has removed yet.
 #[derive(Debug)]
 pub struct Alive {
-    ids: Vec<u32>,
-    columns: Columns,
+    flags: Vec<bool>,
+    len: usize,
+    all: Arc<Columns>,
+    // Made when asked for: most stages look at a few correspondences and need no list of all.
+    ids: OnceLock<Vec<u32>>,
+    columns: OnceLock<Columns>,
 }
 
 impl Alive {
     pub(crate) fn all(pairs: &PointPairs) -> Self {
-        Self { ids: (0..pairs.len() as u32).collect(), columns: pairs.columns.clone() }
+        Self::filtered(pairs, |_| true)
     }
 
     /// Those of `pairs` that `keep` keeps.
     pub(crate) fn filtered(pairs: &PointPairs, keep: impl Fn(u32) -> bool) -> Self {
-        let ids: Vec<u32> = (0..pairs.len() as u32).filter(|&id| keep(id)).collect();
-        let columns = pairs.columns.gather(&ids);
-        Self { ids, columns }
+        let flags: Vec<bool> = (0..pairs.len() as u32).map(keep).collect();
+        let len = flags.iter().filter(|&&alive| alive).count();
+        let all = Arc::clone(&pairs.columns);
+        Self { flags, len, all, ids: OnceLock::new(), columns: OnceLock::new() }
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Whether a correspondence is among them.
+    #[must_use]
+    pub fn contains(&self, id: u32) -> bool {
+        self.flags[id as usize]
     }
 
     /// Their ids, ascending.
     #[must_use]
     pub fn ids(&self) -> &[u32] {
-        &self.ids
+        self.ids.get_or_init(|| {
+            (0_u32..).zip(&self.flags).filter(|&(_, &alive)| alive).map(|(id, _)| id).collect()
+        })
     }
 
     /// Their points, row by row as in [`Self::ids`]; compacted so that kernels run over nothing else.
     #[must_use]
     pub fn columns(&self) -> &Columns {
-        &self.columns
+        self.columns.get_or_init(|| self.all.gather(self.ids()))
     }
 
     /// Takes `ids` out; returns how many of them were alive.
-    pub(crate) fn remove(&mut self, ids: &[u32], pairs: &PointPairs) -> usize {
-        let mut gone = ids.to_vec();
-        gone.sort_unstable();
-        let before = self.ids.len();
-        self.ids.retain(|id| gone.binary_search(id).is_err());
-        self.columns = pairs.columns.gather(&self.ids);
-        before - self.ids.len()
+    pub(crate) fn remove(&mut self, ids: &[u32]) -> usize {
+        let before = self.len;
+        for &id in ids {
+            self.len -= usize::from(std::mem::replace(&mut self.flags[id as usize], false));
+        }
+        if self.len < before {
+            (self.ids, self.columns) = (OnceLock::new(), OnceLock::new());
+        }
+        before - self.len
     }
 }

@@ -5,6 +5,7 @@
 
 use crate::correspondence::Alive;
 use crate::params::Params;
+use crate::scene::Claims;
 use crate::stages::{Context, Validate};
 use crate::state::{Found, Problem};
 
@@ -13,25 +14,25 @@ pub(crate) struct Shares {
     /// For each pose the (target row, distance) it explains.
     explained: Vec<Vec<(u32, f64)>>,
     /// For each target row the pose nearest to it.
-    owners: Vec<Option<usize>>,
+    owners: Vec<u32>,
 }
 
 impl Shares {
     pub(crate) fn new(problem: &Problem<'_>, found: &[Found]) -> Self {
         let explained = found.iter().map(|found| found.explained.clone()).collect();
-        let mut shares = Self { explained, owners: vec![None; problem.scene.target.points.len()] };
+        let mut shares = Self { explained, owners: vec![Claims::NOBODY; problem.scene.target.points.len()] };
         shares.share_out();
         shares
     }
 
     fn share_out(&mut self) {
         let mut nearest = vec![f64::INFINITY; self.owners.len()];
-        self.owners.fill(None);
-        for (pose, explained) in self.explained.iter().enumerate() {
+        self.owners.fill(Claims::NOBODY);
+        for (pose, explained) in (0_u32..).zip(&self.explained) {
             for &(row, distance) in explained {
                 if distance < nearest[row as usize] {
                     nearest[row as usize] = distance;
-                    self.owners[row as usize] = Some(pose);
+                    self.owners[row as usize] = pose;
                 }
             }
         }
@@ -39,7 +40,7 @@ impl Shares {
 
     /// Whether no other pose is nearer to anything that this one explains.
     fn owns_all(&self, pose: usize) -> bool {
-        self.explained[pose].iter().all(|&(row, _)| self.owners[row as usize] == Some(pose))
+        self.explained[pose].iter().all(|&(row, _)| self.owners[row as usize] == pose as u32)
     }
 
     /// Takes a pose out; what it owned goes to the next nearest.
@@ -56,10 +57,10 @@ impl Shares {
         pose: usize,
         ask: impl FnOnce(&Context<'_>) -> T,
     ) -> T {
-        let claimed: Vec<bool> = self.owners.iter().map(|owner| owner.is_some_and(|o| o != pose)).collect();
-        let is_free = |id: u32| !claimed[problem.pairs.target_rows[id as usize] as usize];
+        let claims = Claims::of_others(&self.owners, pose as u32);
+        let is_free = |id: u32| !claims.contains(problem.pairs.target_rows[id as usize]);
         let alive = Alive::filtered(&problem.pairs, is_free);
-        ask(&problem.context_of(params, 0, &alive, &claimed))
+        ask(&problem.context_of(params, 0, &alive, claims))
     }
 }
 

@@ -40,5 +40,5 @@ pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};
 pub use registration::{Pose, Registration, Round, StopReason, Timings};
-pub use scene::{Cloud, PreparedCloud, Scene};
+pub use scene::{Claims, Cloud, Detail, PreparedCloud, Scene};
 pub use state::State;

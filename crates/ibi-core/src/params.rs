@@ -177,8 +177,14 @@ impl Params {
             min_normal_cos: Some(0.5),
             oriented_normals: true,
             t_s: 4,
-            scs: LocalGtm { tau_pr: 2.0, min_length_pr: 2.0, normal_tolerance: 0.3, ..LocalGtm::default() }
-                .into(),
+            scs: LocalGtm {
+                tau_pr: 2.0,
+                min_length_pr: 2.0,
+                normal_tolerance: 0.3,
+                max_degree: 256,
+                ..LocalGtm::default()
+            }
+            .into(),
             te: Irls::default().into(),
             refine: Refine::Icp,
             hv: Overlap { t_overlap: 0.35, exclusive: true }.into(),
@@ -257,6 +263,10 @@ pub(crate) fn at_least_1(name: &'static str, value: u32) -> Result<(), Error> {
 
 pub(crate) fn at_least_3(name: &'static str, value: u32) -> Result<(), Error> {
     check(name, value.into(), value >= 3, "at least 3")
+}
+
+pub(crate) fn at_least_8(name: &'static str, value: u32) -> Result<(), Error> {
+    check(name, value.into(), value >= 8, "at least 8")
 }
 
 pub(crate) fn at_most(name: &'static str, value: u32, max: u32, allowed: &'static str) -> Result<(), Error> {

@@ -8,15 +8,21 @@ use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
 use crate::joint::joint_check;
-use crate::kernels::par::Pool;
-use crate::params::Params;
-use crate::registration::{Registration, Round, StopReason};
-use crate::scene::{Cloud, PreparedCloud, Scene};
-use crate::stages::{Enhance, EstimatePose, SelectSeeds, Validate};
-use crate::state::{Problem, State};
+use crate::kernels::par::{self, Pool};
+use crate::params::{Params, Removal};
+use crate::registration::{Registration, Round, StopReason, Timings};
+use crate::scene::{Cloud, Detail, PreparedCloud, Scene};
+use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict};
+use crate::state::{Play, Problem, State, Tried};
 
 /// A contest accepts nothing below this share of its best value.
 const CONTEST_MARGIN: f64 = 0.8;
+
+/// A pose with an MAE of so much is looked at closely at once.
+const MANY_INLIERS: f64 = 10.0;
+
+/// Poses that move no point farther apart than this are as good as each other.
+const NEGLIGIBLE_PR: f64 = 0.3;
 
 /// A prepared source, the parameters and the four stages; registers the source to any number of targets.
 ///
@@ -44,7 +50,7 @@ const CONTEST_MARGIN: f64 = 0.8;
 /// # Ok::<(), ibi_core::Error>(())
 /// ```
 pub struct Registrar<'a> {
-    source: PreparedCloud<'a>,
+    source: Arc<PreparedCloud<'a>>,
     params: Params,
     scs: Option<Box<dyn SelectSeeds>>,
     ce: Option<Box<dyn Enhance>>,
@@ -61,8 +67,14 @@ impl<'a> Registrar<'a> {
     /// If the source has fewer than three points, or one that is not finite, or all at one place, or normals
     /// that do not fit it.
     pub fn new(source: &Cloud<'a>) -> Result<Self, Error> {
-        Ok(Self {
-            source: PreparedCloud::new(source, Argument::Src, Argument::SrcNormals)?,
+        Ok(Self::of(Arc::new(PreparedCloud::source(source)?)))
+    }
+
+    /// For a source that was prepared before, with default parameters: many registrars may share one.
+    #[must_use]
+    pub fn of(source: Arc<PreparedCloud<'a>>) -> Self {
+        Self {
+            source,
             params: Params::default(),
             scs: None,
             ce: None,
@@ -70,7 +82,7 @@ impl<'a> Registrar<'a> {
             hv: None,
             num_threads: None,
             cancel: CancelToken::default(),
-        })
+        }
     }
 
     /// Sets the parameters; they are checked when a run begins.
@@ -165,7 +177,7 @@ impl<'a> Registrar<'a> {
         let pool = Arc::new(Pool::new(self.num_threads)?);
         let (scene, pairs) = pool.install(|| {
             let target = PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals)?;
-            let scene = Scene::new(&self.source, target, self.params.resolution)?;
+            let scene = Scene::new(&self.source, target, &self.params)?;
             let pairs = PointPairs::new(correspondences, &scene, self.params.oriented_normals)?;
             Ok::<_, Error>((scene, pairs))
         })?;
@@ -211,35 +223,99 @@ impl<'a> Registrar<'a> {
 
     fn round(&self, state: &mut State<'_>) -> ControlFlow<StopReason, Round> {
         state.check_limits(&self.params)?;
-        let context = state.problem.context(&self.params, state.rounds.len());
-        let times = &mut state.timings;
-
-        let seeds = timed(&mut times.scs_s, || self.scs().select_seeds(&context));
+        let play = match state.ahead.take() {
+            Some(play) => play,
+            None => self.play(state),
+        };
         state.problem.interrupt.check()?;
-        if seeds.len() < self.params.t_s as usize {
-            let (value, threshold) = (seeds.len() as u32, self.params.t_s);
+        state.timings.add(&play.timings);
+        if play.seeds.len() < self.params.t_s as usize {
+            let (value, threshold) = (play.seeds.len() as u32, self.params.t_s);
             return ControlFlow::Break(StopReason::FewSeeds { value, threshold });
         }
-        let dense = timed(&mut times.ce_s, || self.ce().enhance(&context, &seeds));
-        let mut estimate = timed(&mut times.te_s, || self.te().estimate_pose(&context, &dense));
-        let mut judged = estimate.hypothesis.map(|hypothesis| {
-            timed(&mut times.hv_s, || (hypothesis, self.hv().validate(&context, &hypothesis)))
-        });
-        if let Some(refined) = timed(&mut times.refine_s, || context.refined(estimate.hypothesis?)) {
-            let verdict = timed(&mut times.hv_s, || self.hv().validate(&context, &refined));
-            if judged.is_none_or(|(_, before)| verdict.value >= before.value) {
-                judged = Some((refined, verdict));
-            }
+        let verdict = state.conclude(&self.params, play);
+        if verdict.is_some_and(|verdict| verdict.accepted() && self.hv().is_sure(&verdict)) {
+            state.measure_candidates(&self.params, self.hv());
+            state.accept_best(&self.params, f64::NEG_INFINITY);
         }
-        estimate.hypothesis = judged.map(|(hypothesis, _)| hypothesis);
-        let verdict = judged.map(|(_, verdict)| verdict);
-        state.problem.interrupt.check()?;
-
-        state.conclude(&self.params, &seeds, &dense, &estimate, verdict);
         if state.rounds_since_settling >= self.params.n_contest {
             self.settle(state);
         }
         state.last_round()
+    }
+
+    /// What the stages make of the next round. Where a second thread is idle it plays the round after it at the same
+    /// time, as it will be if this one comes to nothing: most do, and else it is played again.
+    fn play(&self, state: &mut State<'_>) -> Play {
+        let (problem, tried, round) = (&state.problem, &state.tried, state.rounds.len());
+        let context = problem.context(&self.params, round);
+        let mut timings = Timings::default();
+        let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
+        if !self.plays_ahead() || seeds.len() < self.params.t_s as usize {
+            return self.play_seeds(&context, tried, seeds, timings);
+        }
+        let barred = problem.also_barred(seeds.ids());
+        let (now, next) = par::join(
+            || self.play_seeds(&context, tried, seeds, timings),
+            || {
+                let context = Context { barred: &barred, ..problem.context(&self.params, round + 1) };
+                let mut timings = Timings::default();
+                let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
+                self.play_seeds(&context, tried, seeds, timings)
+            },
+        );
+        state.ahead = Some(next);
+        now
+    }
+
+    /// Whether a round may be played before the one before it is concluded. Not with stages of the user's, which may
+    /// count their rounds; nor if a round removes correspondences whatever comes of it.
+    fn plays_ahead(&self) -> bool {
+        let has_own_stage = self.scs.is_some() || self.ce.is_some() || self.te.is_some() || self.hv.is_some();
+        par::is_parallel() && !has_own_stage && self.params.removal == Removal::Inliers
+    }
+
+    /// CE -> TE -> HV.
+    fn play_seeds(&self, context: &Context<'_>, tried: &Tried, seeds: Ranked, mut timings: Timings) -> Play {
+        if seeds.len() < self.params.t_s as usize || context.interrupt.is_set() {
+            return Play { seeds, timings, ..Play::default() };
+        }
+        let dense = timed(&mut timings.ce_s, || self.ce().enhance(context, &seeds));
+        let estimate = timed(&mut timings.te_s, || self.te().estimate_pose(context, &dense));
+        let judged = estimate.hypothesis.map(|raw| {
+            // Many seeds lead to one and the same pose: it is judged once. (A stage of the user's may think otherwise.)
+            let before = tried.get(&raw.target_from_source).filter(|_| self.hv.is_none());
+            before.unwrap_or_else(|| self.judge(context, raw, &mut timings))
+        });
+        Play { seeds, dense, estimate, judged, timings }
+    }
+
+    /// Polishes a hypothesis and validates it. If it has few inliers and a glance shows that it is
+    /// hopeless, neither is done to the end.
+    fn judge(&self, context: &Context<'_>, raw: Hypothesis, timings: &mut Timings) -> (Hypothesis, Verdict) {
+        let Timings { refine_s, hv_s, .. } = timings;
+        let scene = context.scene;
+        let shift = |a: &Hypothesis, b: &Hypothesis| {
+            scene.source.displacement(&a.target_from_source, &b.target_from_source) / scene.resolution
+        };
+        let is_poor = raw.score < MANY_INLIERS && !scene.is_one_sided(context.params);
+        let mut rough = raw;
+        if is_poor && let Some(polished) = timed(refine_s, || context.refined(Detail::Glance, raw)) {
+            rough = polished;
+            if let Some(verdict) = timed(hv_s, || self.hv().glance(context, &rough)) {
+                return (rough, verdict);
+            }
+        }
+        let hypothesis = timed(refine_s, || context.refined(Detail::Look, rough)).unwrap_or(raw);
+        let verdict = timed(hv_s, || self.hv().validate(context, &hypothesis));
+        // The clouds of a cluttered scene may draw a good pose away.
+        if verdict.accepted() && shift(&raw, &hypothesis) > NEGLIGIBLE_PR {
+            let before = timed(hv_s, || self.hv().validate(context, &raw));
+            if before.value > verdict.value {
+                return (raw, before);
+            }
+        }
+        (hypothesis, verdict)
     }
 
     /// Ends a contest: of the hypotheses that passed validation, the one with the best value becomes an

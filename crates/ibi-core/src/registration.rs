@@ -176,7 +176,7 @@ impl std::fmt::Display for StopReason {
     }
 }
 
-/// Seconds of wall time.
+/// Seconds of wall time. Where two rounds are played at the same time, the stages count the seconds of both.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[non_exhaustive]
@@ -195,4 +195,16 @@ pub struct Timings {
     pub hv_s: f64,
     /// Everything from `begin` to the result.
     pub total_s: f64,
+}
+
+impl Timings {
+    pub(crate) fn add(&mut self, other: &Self) {
+        self.prepare_s += other.prepare_s;
+        self.scs_s += other.scs_s;
+        self.ce_s += other.ce_s;
+        self.te_s += other.te_s;
+        self.refine_s += other.refine_s;
+        self.hv_s += other.hv_s;
+        self.total_s += other.total_s;
+    }
 }

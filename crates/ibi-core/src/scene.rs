@@ -6,10 +6,10 @@ use std::sync::OnceLock;
 use nalgebra::{Isometry3, Point3, Vector3};
 
 use crate::error::{Argument, Error};
-use crate::kernels::icp::icp;
+use crate::kernels::icp::{Stop, icp};
+use crate::kernels::nearby::{Nearby, mean_spacing};
 use crate::kernels::neighbors::Neighbors;
 use crate::kernels::overlap::{Contact, Place, Surface, chance_fit, fit, places};
-use crate::kernels::par;
 use crate::kernels::rng::Rng;
 use crate::metrics::diameter;
 use crate::params::Params;
@@ -66,8 +66,6 @@ pub struct PreparedCloud<'a> {
     pub normals: Option<Vec<Vector3<f64>>>,
     /// Where the depth camera stood.
     pub viewpoint: Option<Point3<f64>>,
-    /// kd-tree over the points.
-    pub neighbors: Neighbors,
     /// Mean distance of a point to its nearest other point, in data units.
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
@@ -79,9 +77,18 @@ pub struct PreparedCloud<'a> {
     /// Fewer still, for a first glance.
     scout: Probe,
     diameter: OnceLock<f64>,
+    tree: OnceLock<Neighbors>,
 }
 
 impl<'a> PreparedCloud<'a> {
+    /// Checks and prepares a source, for any number of registrations: its spacing and, once asked for, its diameter.
+    ///
+    /// # Errors
+    /// Those of [`crate::Registrar::new`].
+    pub fn source(cloud: &Cloud<'a>) -> Result<Self, Error> {
+        Self::new(cloud, Argument::Src, Argument::SrcNormals)
+    }
+
     /// Checks `cloud` and builds what the stages need. `argument` and `normals` are what errors call them.
     pub(crate) fn new(cloud: &Cloud<'a>, argument: Argument, normals: Argument) -> Result<Self, Error> {
         let points = &cloud.points;
@@ -104,12 +111,10 @@ impl<'a> PreparedCloud<'a> {
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
         }
-        let neighbors = Neighbors::new(points);
-        let spacing = neighbors.mean_spacing(points);
+        let spacing = mean_spacing(points);
         Ok(Self {
             points: points.clone(),
             viewpoint: cloud.viewpoint,
-            neighbors,
             spacing,
             extent,
             centre,
@@ -117,6 +122,7 @@ impl<'a> PreparedCloud<'a> {
             scout: Probe::new(points, unit_normals.as_deref(), SCOUT_POINTS),
             normals: unit_normals,
             diameter: OnceLock::new(),
+            tree: OnceLock::new(),
         })
     }
 }
@@ -126,6 +132,11 @@ impl PreparedCloud<'_> {
     #[must_use]
     pub fn diameter(&self) -> f64 {
         *self.diameter.get_or_init(|| diameter(&self.points))
+    }
+
+    /// kd-tree over the points, built when first asked for: for nearest points at any distance.
+    pub(crate) fn tree(&self) -> &Neighbors {
+        self.tree.get_or_init(|| Neighbors::new(&self.points))
     }
 
     /// An upper bound of how far two poses move a point of this cloud apart, data units.
@@ -165,6 +176,45 @@ impl Probe {
     }
 }
 
+/// Which scene points accepted instances explain.
+#[derive(Debug, Clone, Copy)]
+pub struct Claims<'a> {
+    /// For each row of the target the instance that explains it, or [`Self::NOBODY`].
+    owners: &'a [u32],
+    /// An instance whose claims do not count.
+    except: u32,
+}
+
+impl<'a> Claims<'a> {
+    /// The owner of a point that no instance explains.
+    pub(crate) const NOBODY: u32 = u32::MAX;
+
+    pub(crate) fn new(owners: &'a [u32]) -> Self {
+        Self { owners, except: Self::NOBODY }
+    }
+
+    /// All claims but those of one instance.
+    pub(crate) fn of_others(owners: &'a [u32], instance: u32) -> Self {
+        Self { owners, except: instance }
+    }
+
+    /// Whether an accepted instance explains a row of the target.
+    #[must_use]
+    pub fn contains(&self, row: u32) -> bool {
+        let owner = self.owners[row as usize];
+        owner != Self::NOBODY && owner != self.except
+    }
+}
+
+/// How many source points are looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Detail {
+    /// 64, enough to see that a pose is hopeless.
+    Glance,
+    /// 256, enough to judge it.
+    Look,
+}
+
 /// Both clouds of a run.
 #[derive(Debug)]
 pub struct Scene<'a> {
@@ -174,13 +224,17 @@ pub struct Scene<'a> {
     pub target: PreparedCloud<'a>,
     /// pr: the mean of the two clouds' spacings, or the value given in the parameters. Data units.
     pub resolution: f64,
+    /// The source points within the reach of all questions: 2 `d_op` or `t_he`, whichever is more.
+    pub near_source: Nearby,
+    /// The target points within the same reach.
+    pub near_target: Nearby,
 }
 
 impl<'a> Scene<'a> {
     pub(crate) fn new(
         source: &'a PreparedCloud<'a>,
         target: PreparedCloud<'a>,
-        resolution: Option<f64>,
+        params: &Params,
     ) -> Result<Self, Error> {
         let (src, tgt) = (Argument::SrcNormals, Argument::TgtNormals);
         match (&source.normals, &target.normals) {
@@ -197,12 +251,15 @@ impl<'a> Scene<'a> {
                 return Err(Error::DifferentUnits { small, extent: s.extent, large, spacing: l.spacing });
             }
         }
-        let resolution = resolution.unwrap_or(0.5 * (source.spacing + target.spacing));
+        let resolution = params.resolution.unwrap_or(0.5 * (source.spacing + target.spacing));
         if resolution <= 0.0 {
             // Points all in coincident pairs: no spacing, although there is an extent.
             return Err(Error::NoExtent { argument: Argument::Src });
         }
-        Ok(Self { source, target, resolution })
+        let reach = (2.0 * params.d_op_pr).max(params.t_he_pr) * resolution;
+        let (near_source, near_target) =
+            (Nearby::new(&source.points, reach), Nearby::new(&target.points, reach));
+        Ok(Self { source, target, resolution, near_source, near_target })
     }
 }
 
@@ -212,14 +269,20 @@ impl Scene<'_> {
     #[must_use]
     pub fn places(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Vec<Place> {
         let (source, target, contact) = self.surfaces(params, params.d_op_pr);
-        places(&source, &target, &self.target.neighbors, target_from_source, &contact)
+        places(&source, &target, &self.near_target, target_from_source, &contact)
     }
 
-    /// The fit of the moved source to the target points that are not `claimed`, within a reach of 2 `d_op`.
+    /// The fit of the moved source to the target points that are not claimed, within a reach of 2 `d_op`.
     #[must_use]
-    pub fn fit(&self, params: &Params, target_from_source: &Isometry3<f64>, claimed: Option<&[bool]>) -> f64 {
-        let (source, target, contact) = self.probed(params, &self.source.probe);
-        fit(&source, &target, &self.target.neighbors, target_from_source, &contact, claimed)
+    pub fn fit(
+        &self,
+        params: &Params,
+        detail: Detail,
+        target_from_source: &Isometry3<f64>,
+        is_claimed: impl Fn(u32) -> bool + Sync,
+    ) -> f64 {
+        let (source, target, contact) = self.probed(params, detail);
+        fit(&source, &target, &self.near_target, target_from_source, &contact, is_claimed)
     }
 
     /// The fit that chance gives a pose somewhere on the target.
@@ -227,52 +290,65 @@ impl Scene<'_> {
     pub fn chance_fit(&self, params: &Params) -> f64 {
         let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
         let rng = Rng::new(params.seed, 0, Stage::Hv as u32);
-        chance_fit(&source, &target, &self.target.neighbors, &contact, rng, CHANCE_SAMPLES)
+        chance_fit(&source, &target, &self.near_target, &contact, rng, CHANCE_SAMPLES)
     }
 
-    /// For each of `points` (of the target) the nearest point of the moved source, if within `distance_pr`: its row
-    /// and the distance in data units. A point within `d_op` is explained by the pose.
-    #[must_use]
-    pub fn nearest_source(
+    /// For each of `points` (of the target), given with a key, that lies within `distance_pr` of the moved source: the
+    /// key, the row of the nearest source point and the distance in data units. A point within `d_op` is explained by
+    /// the pose. `distance_pr` is at most 2 `d_op`.
+    pub fn nearest_source<K>(
         &self,
         distance_pr: f64,
         target_from_source: &Isometry3<f64>,
-        points: &[Point3<f64>],
-    ) -> Vec<Option<(u32, f64)>> {
+        points: impl IntoIterator<Item = (K, Point3<f64>)>,
+    ) -> Vec<(K, u32, f64)> {
         let distance = distance_pr * self.resolution;
-        let source_from_target = target_from_source.inverse();
+        let back = target_from_source.inverse();
+        let (rotation, shift) = (back.rotation.to_rotation_matrix(), back.translation.vector);
         // Far points need no search.
         let (centre, radius) = (self.source.centre, 0.5 * self.source.extent + distance);
-        par::map(points.len(), 256, |i| {
-            let back = source_from_target * points[i];
-            if (back - centre).norm_squared() > radius * radius {
-                return None;
+        let near = points.into_iter().filter_map(|(key, point)| {
+            let moved = rotation * point + shift;
+            ((moved - centre).norm_squared() <= radius * radius).then_some((key, moved))
+        });
+        let mut found = Vec::new();
+        self.near_source.nearest_each(near, |key, moved, row| {
+            let Some(row) = row else { return };
+            let gap = (moved - self.source.points[row as usize]).norm();
+            if gap <= distance {
+                found.push((key, row, gap));
             }
-            let (row, dist_sq) = self.source.neighbors.nearest(&back)?;
-            (dist_sq <= distance * distance).then(|| (row, dist_sq.sqrt()))
-        })
+        });
+        found
     }
 
-    /// Whether a first glance shows that refinement cannot rescue a pose. Never where only one side is seen: there
-    /// right poses fit little too.
-    pub(crate) fn is_hopeless(&self, params: &Params, target_from_source: &Isometry3<f64>) -> bool {
-        if self.is_one_sided(params) {
-            return false;
-        }
-        let (source, target, contact) = self.probed(params, &self.source.scout);
-        fit(&source, &target, &self.target.neighbors, target_from_source, &contact, None) < HOPELESS
+    /// The target points within `distance_pr` of the moved source, with the distance of each in data units.
+    pub(crate) fn explained(&self, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Vec<(u32, f64)> {
+        let centre = target_from_source * self.source.centre;
+        let radius = 0.5 * self.source.extent + distance_pr * self.resolution;
+        let rows = self.near_target.within(&centre, radius);
+        let points = rows.map(|row| (row, self.target.points[row as usize]));
+        let near = self.nearest_source(distance_pr, target_from_source, points);
+        near.into_iter().map(|(row, _, distance)| (row, distance)).collect()
     }
 
-    /// The pose polished on the two clouds by ICP within 2 `d_op`.
+    /// The pose polished on the two clouds by ICP within 2 `d_op`: on few points for a `first glance`, which brings a
+    /// poor pose most of the way at a quarter of the cost, or on more.
     #[must_use]
-    pub fn icp(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
-        // From one side few points are seen, and they are needed all.
-        let (source, target, contact) = if self.is_one_sided(params) {
-            self.surfaces(params, 2.0 * params.d_op_pr)
-        } else {
-            self.probed(params, &self.source.probe)
+    pub fn icp(
+        &self,
+        params: &Params,
+        detail: Detail,
+        target_from_source: &Isometry3<f64>,
+    ) -> Isometry3<f64> {
+        let (source, target, contact) = self.probed(params, detail);
+        let stop = match detail {
+            Detail::Glance => Stop { steps: 8, shift: 0.02 },
+            // Point-to-plane may come from far, and comes to rest; point-to-point creeps on.
+            Detail::Look if target.normals.is_some() => Stop { steps: 20, shift: 0.003 },
+            Detail::Look => Stop { steps: 12, shift: 0.003 },
         };
-        icp(&source, &target, &self.target.neighbors, target_from_source, &contact, ICP_STEPS)
+        icp(&source, &target, &self.near_target, target_from_source, &contact, stop)
     }
 
     /// Whether source points that face away from the viewpoint are left out.
@@ -281,10 +357,17 @@ impl Scene<'_> {
         with_normals && params.oriented_normals && self.target.viewpoint.is_some()
     }
 
-    /// A few source points against the target within a reach of 2 `d_op`.
-    fn probed<'p>(&'p self, params: &Params, probe: &'p Probe) -> (Surface<'p>, Surface<'p>, Contact) {
-        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-        (probe.surface(params.min_normal_cos.is_some()), target, contact)
+    /// A few source points against the target within a reach of 2 `d_op`; all of them if they are seen from one side:
+    /// then few are seen, and they are needed all.
+    fn probed(&self, params: &Params, detail: Detail) -> (Surface<'_>, Surface<'_>, Contact) {
+        let (all, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let with_normals = params.min_normal_cos.is_some();
+        let source = match detail {
+            _ if self.is_one_sided(params) => all,
+            Detail::Glance => self.source.scout.surface(with_normals),
+            Detail::Look => self.source.probe.surface(with_normals),
+        };
+        (source, target, contact)
     }
 
     fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact) {
@@ -299,14 +382,8 @@ impl Scene<'_> {
     }
 }
 
-/// Refinement rescues no pose that fits less than this.
-const HOPELESS: f64 = 0.2;
-
 /// Enough to know the fit by chance to a hundredth.
 const CHANCE_SAMPLES: usize = 1000;
-
-/// Steps of a refinement: point-to-plane is done after five or six.
-const ICP_STEPS: u32 = 8;
 
 /// Above this a square is no longer finite in `f64`, whatever it is multiplied with.
 const MAX_COORDINATE: f64 = 1e100;

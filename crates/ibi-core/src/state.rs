@@ -15,7 +15,7 @@ use crate::kernels::overlap::overlap;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
-use crate::scene::Scene;
+use crate::scene::{Claims, Detail, Scene};
 use crate::stages::{Chance, Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
 
 /// Fewest correspondences that fix a pose.
@@ -29,6 +29,9 @@ pub struct State<'a> {
     pub(crate) timings: Timings,
     pub(crate) pool: Arc<Pool>,
     pub(crate) rounds_since_settling: u32,
+    pub(crate) tried: Tried,
+    /// The next round, played beforehand; nothing has changed since but what a round that comes to nothing changes.
+    pub(crate) ahead: Option<Play>,
     candidates: Vec<Candidate>,
     pub(crate) found: Vec<Found>,
     /// Rounds that had been played when a hypothesis last passed validation, or an instance was last found.
@@ -43,7 +46,8 @@ pub(crate) struct Problem<'a> {
     pub(crate) pairs: PointPairs,
     pub(crate) alive: Alive,
     pub(crate) barred: Vec<bool>,
-    pub(crate) claimed: Vec<bool>,
+    /// For each row of the target the instance that explains it.
+    pub(crate) owners: Vec<u32>,
     pub(crate) graph: OnceLock<Graph>,
     pub(crate) chance: OnceLock<Chance>,
     pub(crate) interrupt: Interrupt,
@@ -57,6 +61,34 @@ struct Candidate {
     round: u32,
     /// How many instances had claimed their points when it was measured.
     measured_at: u32,
+}
+
+/// What the stages made of a round.
+#[derive(Debug, Default)]
+pub(crate) struct Play {
+    pub(crate) seeds: Ranked,
+    pub(crate) dense: Ranked,
+    pub(crate) estimate: Estimate,
+    /// The hypothesis as it was judged, polished or not.
+    pub(crate) judged: Option<(Hypothesis, Verdict)>,
+    pub(crate) timings: Timings,
+}
+
+/// The estimated poses since an instance was last found, and what became of each.
+#[derive(Debug, Default)]
+pub(crate) struct Tried(Vec<(Isometry3<f64>, (Hypothesis, Verdict))>);
+
+impl Tried {
+    /// What became of `pose`, if it has been tried.
+    pub(crate) fn get(&self, pose: &Isometry3<f64>) -> Option<(Hypothesis, Verdict)> {
+        self.0.iter().find(|(tried, _)| tried == pose).map(|&(_, judged)| judged)
+    }
+
+    fn add(&mut self, pose: &Isometry3<f64>, judged: (Hypothesis, Verdict)) {
+        if self.get(pose).is_none() {
+            self.0.push((*pose, judged));
+        }
+    }
 }
 
 /// An accepted pose and its round.
@@ -77,13 +109,13 @@ impl Found {
 impl<'a> Problem<'a> {
     pub(crate) fn new(scene: Scene<'a>, pairs: PointPairs, interrupt: Interrupt) -> Self {
         let (alive, barred) = (Alive::all(&pairs), vec![false; pairs.len()]);
-        let claimed = vec![false; scene.target.points.len()];
+        let owners = vec![Claims::NOBODY; scene.target.points.len()];
         Self {
             scene,
             pairs,
             alive,
             barred,
-            claimed,
+            owners,
             graph: OnceLock::new(),
             chance: OnceLock::new(),
             interrupt,
@@ -102,19 +134,30 @@ impl<'a> Problem<'a> {
         if let Some(graph) = self.graph.get_mut() {
             graph.remove(ids);
         }
-        self.alive.remove(ids, &self.pairs) as u32
+        self.alive.remove(ids) as u32
     }
 
-    /// Claims the target points within `d_op` of the accepted model; returns their rows, with the distance of each.
-    fn claim(&mut self, params: &Params, target_from_source: &Isometry3<f64>) -> Vec<(u32, f64)> {
-        let points = &self.scene.target.points;
-        let nearest = self.scene.nearest_source(params.d_op_pr, target_from_source, points);
-        let known = (0_u32..).zip(nearest).filter_map(|(row, by)| Some((row, by?.1)));
-        let explained: Vec<(u32, f64)> = known.collect();
+    /// Claims the target points within `d_op` of an accepted instance; returns their rows, with the distance of each.
+    fn claim(
+        &mut self,
+        params: &Params,
+        instance: u32,
+        target_from_source: &Isometry3<f64>,
+    ) -> Vec<(u32, f64)> {
+        let explained = self.scene.explained(params.d_op_pr, target_from_source);
         for &(row, _) in &explained {
-            self.claimed[row as usize] = true;
+            self.owners[row as usize] = instance;
         }
         explained
+    }
+
+    /// What is barred from leading once `ids` are too.
+    pub(crate) fn also_barred(&self, ids: &[u32]) -> Vec<bool> {
+        let mut barred = self.barred.clone();
+        for &id in ids {
+            barred[id as usize] = true;
+        }
+        barred
     }
 
     /// Bars `ids` from leading; returns how many were not barred before.
@@ -123,7 +166,7 @@ impl<'a> Problem<'a> {
     }
 
     pub(crate) fn context<'c>(&'c self, params: &'c Params, round: usize) -> Context<'c> {
-        self.context_of(params, round, &self.alive, &self.claimed)
+        self.context_of(params, round, &self.alive, Claims::new(&self.owners))
     }
 
     /// A context with other correspondences alive and other scene points claimed.
@@ -132,7 +175,7 @@ impl<'a> Problem<'a> {
         params: &'c Params,
         round: usize,
         alive: &'c Alive,
-        claimed: &'c [bool],
+        claims: Claims<'c>,
     ) -> Context<'c> {
         Context {
             scene: &self.scene,
@@ -141,7 +184,7 @@ impl<'a> Problem<'a> {
             params,
             round: round as u32,
             barred: &self.barred,
-            claimed,
+            claims,
             graph: &self.graph,
             chance: &self.chance,
             interrupt: &self.interrupt,
@@ -158,6 +201,8 @@ impl<'a> State<'a> {
             timings,
             pool,
             rounds_since_settling: 0,
+            tried: Tried::default(),
+            ahead: None,
             candidates: Vec::new(),
             found: Vec::new(),
             last_passed_at: 0,
@@ -184,7 +229,7 @@ impl<'a> State<'a> {
 
     /// Breaks if no further round may be played.
     pub(crate) fn check_limits(&self, params: &Params) -> ControlFlow<StopReason> {
-        let alive = self.problem.alive.ids().len() as u32;
+        let alive = self.problem.alive.len() as u32;
         if alive < MIN_CORRESPONDENCES {
             let threshold = MIN_CORRESPONDENCES;
             return ControlFlow::Break(StopReason::FewCorrespondences { value: alive, threshold });
@@ -207,18 +252,20 @@ impl<'a> State<'a> {
         self.found.len() as u32
     }
 
-    /// Books a round: removes or bars correspondences, enters the hypothesis for the contest if it passed.
-    pub(crate) fn conclude(
-        &mut self,
-        params: &Params,
-        seeds: &Ranked,
-        dense: &Ranked,
-        estimate: &Estimate,
-        verdict: Option<Verdict>,
-    ) {
+    /// Books a round: removes or bars correspondences, enters the hypothesis for the contest if it passed; returns its
+    /// verdict.
+    pub(crate) fn conclude(&mut self, params: &Params, play: Play) -> Option<Verdict> {
+        let Play { seeds, dense, estimate, judged, .. } = play;
+        if let (Some(raw), Some(judged)) = (estimate.hypothesis, judged) {
+            self.tried.add(&raw.target_from_source, judged);
+        }
+        let (hypothesis, verdict) = judged.unzip();
         let index = self.rounds.len() as u32;
-        let num_alive = self.problem.alive.ids().len() as u32;
-        let passed = estimate.hypothesis.filter(|_| verdict.is_some_and(|verdict| verdict.accepted()));
+        let num_alive = self.problem.alive.len() as u32;
+        let passed = hypothesis.filter(|_| verdict.is_some_and(|verdict: Verdict| verdict.accepted()));
+        if passed.is_some() {
+            self.ahead = None;
+        }
         let (removed, barred) = match (params.removal, passed) {
             (Removal::Dense, _) => (dense.ids(), Vec::new()),
             (Removal::Inliers, None) => (&[][..], seeds.ids().to_vec()),
@@ -236,16 +283,17 @@ impl<'a> State<'a> {
             num_dense: dense.len() as u32,
             num_samples: estimate.num_samples,
             num_degenerate: estimate.num_degenerate,
-            hypothesis_score: estimate.hypothesis.map(|h| h.score),
+            hypothesis_score: hypothesis.map(|h| h.score),
             verdict,
             num_removed: self.problem.remove(removed),
             num_barred: self.problem.bar(&barred),
         });
         self.rounds_since_settling += 1;
-        if let (Some(hypothesis), Some(verdict)) = (estimate.hypothesis, verdict.filter(Verdict::accepted)) {
+        if let (Some(hypothesis), Some(verdict)) = (passed, verdict) {
             let measured_at = self.num_found();
             self.enter(params, Candidate { hypothesis, value: verdict.value, round: index, measured_at });
         }
+        verdict
     }
 
     /// Enters a candidate for the contest. Of two that are the same pose the better one stays; only one that is
@@ -311,7 +359,8 @@ impl<'a> State<'a> {
                 last.num_removed += num_removed;
             }
         }
-        let explained = self.problem.claim(params, &target_from_source);
+        let explained = self.problem.claim(params, self.num_found(), &target_from_source);
+        (self.tried, self.ahead) = (Tried::default(), None);
         self.found.push(Found { hypothesis, round, explained });
         self.last_passed_at = self.rounds.len() as u32;
         Some(value)
@@ -320,18 +369,16 @@ impl<'a> State<'a> {
     /// The result: poses measured and ranked, correspondences labelled.
     pub(crate) fn into_registration(mut self, params: &Params, stop_reason: StopReason) -> Registration {
         let shares = params.joint_check.then(|| Shares::new(&self.problem, &self.found));
-        let (everything, unclaimed) =
-            (Alive::all(&self.problem.pairs), vec![false; self.problem.claimed.len()]);
+        let everything = Alive::all(&self.problem.pairs);
         self.problem.context(params, 0).chance();
         let mut measured: Vec<(Pose, Vec<f64>)> = par::map(self.found.len(), 1, |at| {
             let found = &self.found[at];
-            let support = match &shares {
-                Some(shares) => {
-                    shares.alone(&self.problem, params, at, |own| own.support(found.pose(), true))
-                }
-                None => {
-                    self.problem.context_of(params, 0, &everything, &unclaimed).support(found.pose(), false)
-                }
+            let support = if let Some(shares) = &shares {
+                shares.alone(&self.problem, params, at, |own| own.support(Detail::Look, found.pose(), true))
+            } else {
+                let claims = Claims::new(&self.problem.owners);
+                let all = self.problem.context_of(params, 0, &everything, claims);
+                all.support(Detail::Look, found.pose(), false)
             };
             measure(&self.problem, params, found, &support)
         });
@@ -355,10 +402,12 @@ fn measure(problem: &Problem<'_>, params: &Params, found: &Found, support: &Supp
     let pose = *found.pose();
     let (scene, pairs) = (&problem.scene, &problem.pairs);
     let t_he = params.t_he_pr * scene.resolution;
-    let (inliers, residuals_sq): (Vec<u32>, Vec<f64>) = pairs
-        .pairs(0..pairs.len() as u32)
-        .zip(0_u32..)
-        .map(|((p, q), id)| (id, (pose * p - q).norm_squared()))
+    // Found in single precision, decided in double.
+    let mut close = pairs.by_target.close_pairs(&pose, 1.01 * params.t_he_pr);
+    close.sort_unstable();
+    let (inliers, residuals_sq): (Vec<u32>, Vec<f64>) = close
+        .iter()
+        .map(|&id| (id, (pose * pairs.source[id as usize] - pairs.target[id as usize]).norm_squared()))
         .filter(|&(_, residual_sq)| residual_sq < t_he * t_he)
         .unzip();
     let mean_sq = residuals_sq.iter().sum::<f64>() / residuals_sq.len().max(1) as f64;

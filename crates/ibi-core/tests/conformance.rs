@@ -76,6 +76,17 @@ impl Validate for Checked<Hv> {
         assert_eq!(verdict.accepted(), verdict.value > verdict.threshold);
         verdict
     }
+
+    fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
+        let verdict = self.0.glance(context, hypothesis);
+        assert!(verdict.is_none_or(|verdict| verdict.value.is_finite() && !verdict.accepted()));
+        verdict
+    }
+
+    fn is_sure(&self, verdict: &Verdict) -> bool {
+        assert!(verdict.accepted());
+        self.0.is_sure(verdict)
+    }
 }
 
 fn assert_proper(pose: &Isometry3<f64>) {

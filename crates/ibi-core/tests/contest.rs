@@ -71,7 +71,7 @@ fn planned(plan: Plan, params: Params) -> Registrar<'static> {
             // Measured again, it is still the hypothesis of its own round.
             let (x, quality) = at(plan, context.round);
             assert_eq!(hypothesis.target_from_source.translation.x, x as f64);
-            let free = context.claimed[x..x + MODEL].iter().filter(|&&claimed| !claimed).count();
+            let free = (x as u32..(x + MODEL) as u32).filter(|&row| !context.claims.contains(row)).count();
             Verdict { value: quality * free as f64 / MODEL as f64, threshold: THRESHOLD }
         }))
 }

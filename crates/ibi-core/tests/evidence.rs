@@ -10,13 +10,13 @@
 mod oriented;
 
 use ibi_core::kernels::evidence::Support;
-use ibi_core::kernels::neighbors::Neighbors;
+use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, chance_fit, fit, overlap, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::kernels::rng::Rng;
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_testkit::naive;
-use ibi_testkit::strategies::{point, points, rigid_motions};
+use ibi_testkit::strategies::{point, rigid_motions};
 use oriented::{Oriented, clouds};
 use proptest::prelude::*;
 
@@ -144,8 +144,9 @@ fn fit_of(
     claimed: Option<&[bool]>,
     with_normals: bool,
 ) -> f64 {
-    let neighbors = Neighbors::new(&target.points);
-    fit(&source.surface(with_normals), &target.surface(with_normals), &neighbors, pose, contact, claimed)
+    let near = Nearby::new(&target.points, contact.distance);
+    let is_claimed = |row: u32| claimed.is_some_and(|claimed| claimed[row as usize]);
+    fit(&source.surface(with_normals), &target.surface(with_normals), &near, pose, contact, is_claimed)
 }
 
 proptest! {
@@ -179,9 +180,9 @@ proptest! {
             let all = vec![true; target.points.len()];
             prop_assert_eq!(fit_of(&source, &target, &pose, &contact, Some(&all), with_normals), 0.0);
             // A slope below a step.
-            let neighbors = Neighbors::new(&target.points);
+            let near = Nearby::new(&target.points, reach);
             let share = overlap(&places(
-                &source.surface(with_normals), &target.surface(with_normals), &neighbors, &pose, &contact,
+                &source.surface(with_normals), &target.surface(with_normals), &near, &pose, &contact,
             ));
             prop_assert!(free <= share + 1e-12);
         }
@@ -204,14 +205,14 @@ proptest! {
     ) {
         let target = source.moved(&pose).joined(30, &others);
         let (back, forth) = (source.flipped(&one), target.flipped(&other));
-        let neighbors = Neighbors::new(&target.points);
+        let near = Nearby::new(&target.points, 1.0);
         let unoriented = Contact { viewpoint, ..contact(1.0, false) };
         let ask = |source: &Oriented, target: &Oriented, contact: &Contact| {
             let (from, to) = (source.surface(true), target.surface(true));
             (
-                places(&from, &to, &neighbors, &pose, contact),
-                fit(&from, &to, &neighbors, &pose, contact, None).to_bits(),
-                chance_fit(&from, &to, &neighbors, contact, Rng::new(seed, 0, 0), 50).to_bits(),
+                places(&from, &to, &near, &pose, contact),
+                fit(&from, &to, &near, &pose, contact, |_| false).to_bits(),
+                chance_fit(&from, &to, &near, contact, Rng::new(seed, 0, 0), 50).to_bits(),
             )
         };
         let plain = ask(&source, &target, &unoriented);
@@ -286,13 +287,13 @@ fn chance_fit_is_its_twin_and_the_same_for_any_number_of_threads() {
     let source = Oriented::model(60);
     let pose = Isometry3::translation(2.5, 0.3, -0.2);
     let target = source.joined(60, &source.moved(&pose));
-    let neighbors = Neighbors::new(&target.points);
+    let near = Nearby::new(&target.points, 1.5);
     for (reach, oriented) in [(0.5, true), (0.5, false), (1.5, true)] {
         // A viewpoint says nothing about a pose that is not known.
         let contact = Contact { viewpoint: Some(Point3::origin()), ..contact(reach, oriented) };
         let ask = |samples| {
             let rng = Rng::new(3, 0, 3);
-            chance_fit(&source.surface(true), &target.surface(true), &neighbors, &contact, rng, samples)
+            chance_fit(&source.surface(true), &target.surface(true), &near, &contact, rng, samples)
         };
         let (value, twin) = (ask(20_000), naive_chance_fit(&source, &target, &contact, 5000));
         // Both are means of values in 0..=1: four standard errors of the smaller sample are at most 0.028.
@@ -311,41 +312,6 @@ fn chance_fit_is_its_twin_and_the_same_for_any_number_of_threads() {
 }
 
 // ------------------------------------------------------------------------------------- what these are made from
-
-proptest! {
-    #[test]
-    fn within_is_its_twin(cloud in points(0..150), query in point(), distance in 0.0..20.0) {
-        let tree = Neighbors::new(&cloud);
-        for query in cloud.iter().take(3).copied().chain([query]) {
-            let mut rows: Vec<u32> = tree.within(&query, distance).collect();
-            rows.sort_unstable();
-            // Who is exactly there may round to either side.
-            let surely = naive::within(&cloud, &query, distance - 1e-9);
-            let perhaps = naive::within(&cloud, &query, distance + 1e-9);
-            prop_assert!(rows.windows(2).all(|w| w[0] < w[1]), "a row twice");
-            prop_assert!(surely.iter().all(|row| rows.contains(row)));
-            prop_assert!(rows.iter().all(|row| perhaps.contains(row)));
-        }
-    }
-}
-
-#[test]
-fn within_survives_planes_lines_and_identical_points() {
-    let plane: Vec<_> = (0..900).map(|i| Point3::new(f64::from(i % 30), f64::from(i / 30), 0.25)).collect();
-    let place = vec![Point3::new(1.0, 2.0, 3.0); 500];
-    let line: Vec<_> = (0..500).map(|i| Point3::new(0.0, 0.0, f64::from(i))).collect();
-    for cloud in [plane, place, line] {
-        let tree = Neighbors::new(&cloud);
-        for query in cloud.iter().step_by(97) {
-            let mut rows: Vec<u32> = tree.within(query, 2.5).collect();
-            rows.sort_unstable();
-            assert_eq!(rows, naive::within(&cloud, query, 2.5));
-        }
-        // A point is within 0 of itself.
-        assert!(tree.within(&cloud[7], 0.0).any(|row| row == 7));
-    }
-    assert_eq!(Neighbors::new(&[]).within(&Point3::origin(), 9.0).count(), 0);
-}
 
 // The mean of n unit vectors in random directions is about 1 / sqrt(n) long, 0.007; the seeds are fixed.
 #[test]

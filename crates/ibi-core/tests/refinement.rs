@@ -7,8 +7,8 @@ mod common;
 mod oriented;
 
 use common::Mock;
-use ibi_core::kernels::icp::icp;
-use ibi_core::kernels::neighbors::Neighbors;
+use ibi_core::kernels::icp::{Stop, icp};
+use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, Place, Surface, overlap, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -85,11 +85,11 @@ proptest! {
         target.normals.truncate(kept);
         target.points.extend(others.points);
         target.normals.extend(others.normals);
-        let neighbors = Neighbors::new(&target.points);
+        let near = Nearby::new(&target.points, distance);
         let contact = contact(distance, viewpoint);
         for oriented in [false, true] {
             let places =
-                places(&source.surface(oriented), &target.surface(oriented), &neighbors, &pose, &contact);
+                places(&source.surface(oriented), &target.surface(oriented), &near, &pose, &contact);
             prop_assert_eq!(places.len(), source.points.len());
             let moved = source.moved(&pose);
             for (i, &place) in places.iter().enumerate() {
@@ -111,7 +111,7 @@ fn points_that_face_away_are_hidden_and_count_in_no_overlap() {
         normals: vec![Vector3::z(), -Vector3::z(), Vector3::z()],
     };
     let target = Oriented { points: vec![Point3::origin()], normals: vec![Vector3::z()] };
-    let (near, pose) = (Neighbors::new(&target.points), Isometry3::identity());
+    let (near, pose) = (Nearby::new(&target.points, 0.1), Isometry3::identity());
     let at = |oriented, viewpoint| {
         let contact = contact(0.1, viewpoint);
         places(&source.surface(oriented), &target.surface(oriented), &near, &pose, &contact)
@@ -130,16 +130,21 @@ fn points_that_face_away_are_hidden_and_count_in_no_overlap() {
 
 // -------------------------------------------------------------------------------------------------------- icp
 
+/// Ends after so many steps, however small.
+fn after(steps: u32) -> Stop {
+    Stop { steps, shift: 0.0 }
+}
+
 /// The cost that `icp` promises never to raise, from its definition.
 fn cost(
     source: &Surface<'_>,
     target: &Surface<'_>,
-    neighbors: &Neighbors,
+    near: &Nearby,
     pose: &Isometry3<f64>,
     contact: &Contact,
 ) -> f64 {
     let d = contact.distance;
-    let squares: Vec<f64> = places(source, target, neighbors, pose, contact)
+    let squares: Vec<f64> = places(source, target, near, pose, contact)
         .into_iter()
         .enumerate()
         .filter_map(|(i, place)| match place {
@@ -177,14 +182,14 @@ fn icp_comes_closer_to_the_truth() {
         for seed in 0..10 {
             let truth = rng.pose_at(Vector3::new(3.0, -2.0, 5.0));
             let target = Oriented::model(sampling).moved(&truth);
-            let neighbors = Neighbors::new(&target.points);
+            let near = Nearby::new(&target.points, 3.0 * spacing);
             let axis = rng.normal_vector().normalize() * 3_f64.to_radians();
             let shift = rng.normal_vector().normalize() * (0.5 * spacing);
             let off = Isometry3::from_parts(Translation3::from(shift), UnitQuaternion::new(axis));
             let start = truth * off;
             for (oriented, viewpoint) in [(false, None), (true, None), (true, Some(Point3::origin()))] {
                 let (from, to) = (source.surface(oriented), target.surface(oriented));
-                let found = icp(&from, &to, &neighbors, &start, &contact(3.0 * spacing, viewpoint), 20);
+                let found = icp(&from, &to, &near, &start, &contact(3.0 * spacing, viewpoint), after(20));
                 let before = distance(&source.points, &start, &truth);
                 let after = distance(&source.points, &found, &truth);
                 let which = format!("{sampling} points, {oriented} {viewpoint:?}, {seed}");
@@ -201,14 +206,14 @@ fn icp_leaves_the_truth_where_it_is() {
     let source = Oriented::model(300);
     let truth = Rng::new(8).pose_at(Vector3::new(1.0, 2.0, 3.0));
     let target = source.moved(&truth);
-    let neighbors = Neighbors::new(&target.points);
+    let near = Nearby::new(&target.points, 0.5);
     for oriented in [false, true] {
         let (from, to) = (source.surface(oriented), target.surface(oriented));
-        let found = icp(&from, &to, &neighbors, &truth, &contact(0.3, None), 8);
+        let found = icp(&from, &to, &near, &truth, &contact(0.3, None), after(8));
         assert!(distance(&source.points, &found, &truth) < 1e-9);
         // No steps, no change.
         let start = truth * Isometry3::translation(0.01, 0.0, 0.0);
-        assert_eq!(icp(&from, &to, &neighbors, &start, &contact(0.3, None), 0), start);
+        assert_eq!(icp(&from, &to, &near, &start, &contact(0.3, None), after(0)), start);
     }
 }
 
@@ -220,13 +225,13 @@ proptest! {
         start in prop_oneof![rigid_motions(0.3), rigid_motions(5.0), rigid_motions(1e4)],
         distance in prop_oneof![0.01..0.5, 0.5..50.0], viewpoint in viewpoints(), steps in 0..10_u32,
     ) {
-        let neighbors = Neighbors::new(&target.points);
+        let near = Nearby::new(&target.points, distance);
         let contact = contact(distance, viewpoint);
         for oriented in [false, true] {
             let (source, target) = (source.surface(oriented), target.surface(oriented));
-            let found = icp(&source, &target, &neighbors, &start, &contact, steps);
+            let found = icp(&source, &target, &near, &start, &contact, after(steps));
             prop_assert!(is_proper(&found), "{found}");
-            let of = |pose| cost(&source, &target, &neighbors, pose, &contact);
+            let of = |pose| cost(&source, &target, &near, pose, &contact);
             let (before, after) = (of(&start), of(&found));
             prop_assert!(after <= before * (1.0 + 1e-9) + 1e-12, "{before} before, {after} after");
         }
@@ -242,10 +247,10 @@ proptest! {
         );
         let points: Vec<_> = cloud.iter().map(flat).collect();
         let cloud = Oriented { normals: vec![Vector3::z(); points.len()], points };
-        let neighbors = Neighbors::new(&cloud.points);
+        let near = Nearby::new(&cloud.points, distance);
         for oriented in [false, true] {
             let surface = cloud.surface(oriented);
-            let found = icp(&surface, &surface, &neighbors, &start, &contact(distance, None), 8);
+            let found = icp(&surface, &surface, &near, &start, &contact(distance, None), after(8));
             prop_assert!(is_proper(&found), "{found}");
         }
     }
@@ -264,12 +269,12 @@ fn a_plane_settles_on_a_plane_and_does_not_slide_away() {
     let mut rng = Rng::new(2);
     target.points.iter_mut().for_each(|p| p.z += 0.1 * rng.normal());
     target.normals.iter_mut().for_each(|n| *n = (*n + rng.normal_vector() * 1e-3).normalize());
-    let neighbors = Neighbors::new(&target.points);
+    let near = Nearby::new(&target.points, 3.0);
     let turn = UnitQuaternion::new(Vector3::new(0.03, -0.02, 0.2));
     let start = Isometry3::from_parts(Translation3::new(3.3, -2.4, 0.3), turn);
     for oriented in [false, true] {
         let (from, to) = (source.surface(oriented), target.surface(oriented));
-        let found = icp(&from, &to, &neighbors, &start, &contact(3.0, None), 8);
+        let found = icp(&from, &to, &near, &start, &contact(3.0, None), after(8));
         assert!(is_proper(&found));
         let shift = found.translation.vector - start.translation.vector;
         assert!(shift.xy().norm() < 1.0, "slid by {shift}");
@@ -282,12 +287,12 @@ fn a_plane_settles_on_a_plane_and_does_not_slide_away() {
 #[test]
 fn icp_gives_the_same_bits_for_any_number_of_threads() {
     let (source, target) = (Oriented::model(700), Oriented::model(900));
-    let neighbors = Neighbors::new(&target.points);
+    let near = Nearby::new(&target.points, 0.5);
     let start = Isometry3::new(Vector3::new(0.02, -0.03, 0.01), Vector3::new(0.02, 0.03, -0.04));
     let all = || {
         [false, true].map(|oriented| {
             let (from, to) = (source.surface(oriented), target.surface(oriented));
-            let found = icp(&from, &to, &neighbors, &start, &contact(0.3, None), 8);
+            let found = icp(&from, &to, &near, &start, &contact(0.3, None), after(8));
             found.to_homogeneous().map(f64::to_bits)
         })
     };

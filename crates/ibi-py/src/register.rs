@@ -1,11 +1,12 @@
 //! `register`: arrays in, arrays out, the GIL released in between.
 
 use std::ops::ControlFlow;
+use std::sync::Arc;
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
 use ibi_core::nalgebra::{Point3, Vector3};
-use ibi_core::{CancelToken, Cloud, Correspondences, Registrar, Registration, Round};
+use ibi_core::{CancelToken, Cloud, Correspondences, PreparedCloud, Registrar, Registration, Round};
 use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -17,20 +18,50 @@ use crate::{InputError, params, to_py_err};
 const SIGNAL_PERIOD: Duration = Duration::from_millis(20);
 
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<Source>()?;
     m.add_function(wrap_pyfunction!(register_clouds, m)?)
+}
+
+/// A source that was checked and prepared, for any number of registrations.
+#[pyclass(frozen, module = "ibi_rs._core")]
+struct Source(Arc<PreparedCloud<'static>>);
+
+#[pymethods]
+impl Source {
+    #[new]
+    #[pyo3(signature = (points, normals=None))]
+    #[allow(clippy::needless_pass_by_value)] // PyO3 owns
+    fn new(
+        py: Python<'_>,
+        points: PyReadonlyArray2<'_, f64>,
+        normals: Option<PyReadonlyArray2<'_, f64>>,
+    ) -> PyResult<Self> {
+        let cloud = cloud(&points, normals.as_ref())?;
+        let prepared = py.detach(|| PreparedCloud::source(&cloud)).map_err(|e| to_py_err(&e))?;
+        Ok(Self(Arc::new(prepared)))
+    }
+
+    #[getter]
+    fn spacing(&self) -> f64 {
+        self.0.spacing
+    }
+
+    #[getter]
+    fn diameter(&self, py: Python<'_>) -> f64 {
+        py.detach(|| self.0.diameter())
+    }
 }
 
 /// See `ibi_rs.register`, which brings its arguments into the shapes and dtypes that are wanted here.
 #[pyfunction(name = "register")]
-#[pyo3(signature = (src, tgt, corr, params, *, src_normals=None, tgt_normals=None, similarity=None, viewpoint=None, num_threads=None, on_round=None))]
+#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, similarity=None, viewpoint=None, num_threads=None, on_round=None))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's keyword arguments; PyO3 owns
 fn register_clouds<'py>(
     py: Python<'py>,
-    src: PyReadonlyArray2<'py, f64>,
+    source: &Source,
     tgt: PyReadonlyArray2<'py, f64>,
     corr: &Bound<'py, PyAny>,
     params: &str,
-    src_normals: Option<PyReadonlyArray2<'py, f64>>,
     tgt_normals: Option<PyReadonlyArray2<'py, f64>>,
     similarity: Option<PyReadonlyArray1<'py, f64>>,
     viewpoint: Option<[f64; 3]>,
@@ -38,7 +69,7 @@ fn register_clouds<'py>(
     on_round: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = params::parse(params)?;
-    let source = cloud(&src, src_normals.as_ref())?;
+    let source = Arc::clone(&source.0);
     let mut target = cloud(&tgt, tgt_normals.as_ref())?;
     if let Some(viewpoint) = viewpoint {
         target = target.with_viewpoint(Point3::from(viewpoint));
@@ -57,7 +88,7 @@ fn register_clouds<'py>(
             }
         };
         let run = || {
-            let mut registrar = Registrar::new(&source)?.params(params).cancel_token(cancel);
+            let mut registrar = Registrar::of(source).params(params).cancel_token(cancel);
             if let Some(num_threads) = num_threads {
                 registrar = registrar.num_threads(num_threads);
             }

@@ -5,6 +5,7 @@
 
 use super::columns::Columns;
 use super::par;
+use super::replicator::Payoffs;
 
 /// Pairs of rows below which a matrix row or a vote is not worth a thread of its own.
 const GRAIN: usize = 32;
@@ -21,8 +22,7 @@ pub enum Payoff {
     Ratio,
 }
 
-/// The dense payoff matrix, row-major n x n, symmetric with a zero diagonal. `delta_r` in the unit of the
-/// columns.
+/// The dense payoffs, symmetric with a zero diagonal. `delta_r` in the unit of the columns.
 ///
 /// # Complexity
 /// O(n^2) time, 4 n^2 bytes.
@@ -32,11 +32,10 @@ pub fn payoff_matrix(
     payoff: Payoff,
     delta_r: f64,
     interrupted: impl Fn() -> bool + Sync,
-) -> Vec<f32> {
-    let n = pairs.len();
+) -> Payoffs {
     let inv = 1.0 / delta_r as f32;
-    let mut matrix = vec![0.0; n * n];
-    par::for_rows(&mut matrix, n, GRAIN, |i, row| {
+    let mut matrix = Payoffs::zeros(pairs.len());
+    matrix.fill(GRAIN, |i, row| {
         if interrupted() {
             return;
         }
@@ -57,11 +56,34 @@ pub fn payoff_matrix(
 #[must_use]
 pub fn votes(candidates: &Columns, voters: &Columns, delta_r: f64) -> Vec<f32> {
     let inv = 1.0 / delta_r as f32;
-    par::map(candidates.len(), GRAIN, |i| {
-        let (p, q) = candidates.pair(i);
-        voters.sum(|pj, qj| gaussian(distance(p, pj), distance(q, qj), inv))
-    })
+    let grain = VOTE_GRAIN.max(VOTES_PER_THREAD / voters.len().max(1));
+    let chunks = par::chunks(candidates.len(), grain, |run| {
+        let (mut votes, mut of_one) = (vec![0.0; run.len()], vec![0.0; run.len()]);
+        for j in 0..voters.len() {
+            let (p, q) = voters.pair(j);
+            candidates.map_run_into(run.clone(), &mut of_one, |pi, qi| {
+                gaussian(distance(p, pi), distance(q, qi), inv)
+            });
+            for (vote, one) in votes.iter_mut().zip(&of_one) {
+                *vote += one;
+            }
+        }
+        votes
+    });
+    chunks.concat()
 }
+
+/// Rigidities of more than this bring no vote, nor any gaussian payoff.
+pub(crate) fn vote_reach(delta_r: f64) -> f32 {
+    // A little more, for rounding.
+    1.001 * NEGLIGIBLE.sqrt() * delta_r as f32
+}
+
+/// Candidates that one thread takes at a time at least: more fit into no innermost cache.
+const VOTE_GRAIN: usize = 1024;
+
+/// Votes that are worth a thread.
+const VOTES_PER_THREAD: usize = 1 << 16;
 
 #[inline(always)]
 #[allow(clippy::inline_always)] // this and those below are the bodies of the loops above

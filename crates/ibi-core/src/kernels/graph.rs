@@ -4,14 +4,18 @@
 //! below a bound. A wrong pair that is compatible with a right one by chance shares almost no third
 //! correspondence with it, so each edge is weighed by what its ends have in common: second order (Chen et al.
 //! 2022, SC2-PCR). No edge is longer than the model, which makes the graph local: cost grows with the scene.
+//!
+//! The nodes stand in the order of a grid over the target points, so that what is joined is near in memory too.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::ops::Range;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use nalgebra::{Isometry3, Vector3};
 
 use super::columns::Columns;
 use super::grid::Grid;
 use super::par;
+use super::simd::simd;
 
 /// When two correspondences count as compatible. Lengths in the unit of the columns.
 #[derive(Debug, Clone, Copy)]
@@ -26,6 +30,9 @@ pub struct EdgeTest {
     pub normal_tolerance: f32,
     /// Whether edges are weighed by what their ends have in common, or by their own rigidity alone.
     pub second_order: bool,
+    /// Where correspondences have more neighbours than this, only so many of them become nodes that they have about as
+    /// many. Bounds the time (a scene without outliers would be one clique) and the memory.
+    pub max_degree: u32,
 }
 
 /// Unit normals at the two points of each correspondence.
@@ -39,25 +46,36 @@ pub struct PairNormals {
     pub oriented: bool,
 }
 
-/// Compressed rows: the neighbours of each correspondence, ascending, and the second-order weight of the edge;
-/// which correspondences are alive, and the support of each: the sum of its weights to the alive ones.
+/// Compressed rows: the neighbours of each node, ascending, and the second-order weight of the edge; which nodes are
+/// alive, and the support of each: the sum of its weights to the alive ones.
 #[derive(Debug, Default)]
 pub struct Graph {
+    /// The correspondence of each node.
+    ids: Vec<u32>,
+    /// The node of each correspondence, or `NONE`.
+    nodes: Vec<u32>,
     starts: Vec<usize>,
     neighbors: Vec<u32>,
     weights: Vec<f32>,
     alive: Vec<bool>,
     support: Vec<f32>,
-    /// Set through a shared reference, by one thread at a time: the stage that plays the neighbourhoods.
-    futile: Vec<AtomicBool>,
+    /// One more than the seeds that the neighbourhood of a node came to, if they were too few; else 0. Set through a
+    /// shared reference, by one thread at a time: the stage that plays the neighbourhoods.
+    futile: Vec<AtomicU32>,
 }
+
+/// No node.
+const NONE: u32 = u32::MAX;
+
+/// Cells of the grid along the longest edge.
+const CELLS_PER_LENGTH: f32 = 2.0;
 
 impl Graph {
     /// Builds the graph of `pairs`.
     ///
     /// # Complexity
     /// Time: the pairs of target points within `max_length`, plus, for each edge, the neighbours of one end.
-    /// Memory: 8 bytes an edge and direction.
+    /// Memory: 8 bytes an edge and direction, of which there are at most about `max_degree` for each correspondence.
     #[must_use]
     pub fn new(
         pairs: &Columns,
@@ -65,186 +83,454 @@ impl Graph {
         test: &EdgeTest,
         interrupted: impl Fn() -> bool + Sync,
     ) -> Self {
-        let mut graph = Self::first_order(pairs, normals, test, &interrupted);
+        let grid = Grid::new(&pairs.q, test.max_length / CELLS_PER_LENGTH);
+        let finder = Finder { pairs: pairs.gather(grid.order()), normals, grid: &grid, test };
+        let (ids, mut edges) = finder.find(&interrupted);
         if test.second_order {
-            graph.weights = graph.second_order(&interrupted);
+            edges.weigh_by_common_neighbors(&interrupted);
         }
+        let mut graph = edges.mirrored();
+        graph.nodes = vec![NONE; pairs.len()];
+        for (node, &id) in (0_u32..).zip(&ids) {
+            graph.nodes[id as usize] = node;
+        }
+        graph.ids = ids;
         graph.alive = vec![true; graph.len()];
-        graph.futile = (0..graph.len()).map(|_| AtomicBool::new(false)).collect();
-        graph.support = par::map(graph.len(), 64, |i| graph.supported(i as u32));
+        graph.futile = (0..graph.len()).map(|_| AtomicU32::new(0)).collect();
+        graph.support = par::map(graph.len(), 1024, |node| graph.supported(node as u32));
         graph
     }
 
-    /// Takes `ids` out of what is alive. Touches their neighbours only.
+    /// Takes the correspondences `ids` out of what is alive. Touches their neighbours only.
     pub fn remove(&mut self, ids: &[u32]) {
-        for &i in ids {
-            self.alive[i as usize] = false;
+        let nodes: Vec<u32> = ids.iter().filter_map(|&id| self.node(id)).collect();
+        for &node in &nodes {
+            self.alive[node as usize] = false;
         }
-        let mut touched: Vec<u32> = ids.iter().flat_map(|&i| self.edges(i).0).copied().collect();
-        touched.sort_unstable();
-        touched.dedup();
+        let mut is_touched = vec![false; self.len()];
+        for &node in nodes.iter().flat_map(|&node| self.edges(node).0) {
+            is_touched[node as usize] = true;
+        }
+        let touched: Vec<u32> = (0..self.len() as u32).filter(|&node| is_touched[node as usize]).collect();
         // Summed anew, not subtracted: rounding errors must not outlive what caused them.
-        let support = par::map(touched.len(), 64, |t| self.supported(touched[t]));
-        for (&i, support) in touched.iter().zip(support) {
-            self.support[i as usize] = support;
-            *self.futile[i as usize].get_mut() = false;
+        let support = par::map(touched.len(), 1024, |t| self.supported(touched[t]));
+        for (&node, support) in touched.iter().zip(support) {
+            self.support[node as usize] = support;
+            *self.futile[node as usize].get_mut() = 0;
         }
     }
 
-    /// Remembers that the neighbourhood of i came to nothing, until one of its members is removed.
-    pub fn set_futile(&self, i: u32) {
-        self.futile[i as usize].store(true, Ordering::Relaxed);
+    /// Remembers that the neighbourhood of a node came to too few seeds, until one of its members is removed.
+    pub fn set_futile(&self, node: u32, num_seeds: u32) {
+        self.futile[node as usize].store(num_seeds + 1, Ordering::Relaxed);
     }
 
-    /// Whether the neighbourhood of i came to nothing and has not changed since.
+    /// The seeds that the neighbourhood of a node came to, if they were too few and nothing has changed since.
     #[must_use]
-    pub fn is_futile(&self, i: u32) -> bool {
-        self.futile[i as usize].load(Ordering::Relaxed)
+    pub fn futile(&self, node: u32) -> Option<u32> {
+        self.futile[node as usize].load(Ordering::Relaxed).checked_sub(1)
     }
 
-    /// Whether i is alive.
+    /// Whether a node is alive.
     #[must_use]
-    pub fn is_alive(&self, i: u32) -> bool {
-        self.alive[i as usize]
+    pub fn is_alive(&self, node: u32) -> bool {
+        self.alive[node as usize]
     }
 
-    /// The sum of the weights from i to its alive neighbours.
+    /// The sum of the weights from a node to its alive neighbours.
     #[must_use]
-    pub fn support(&self, i: u32) -> f32 {
-        self.support[i as usize]
+    pub fn support(&self, node: u32) -> f32 {
+        self.support[node as usize]
     }
 
-    fn supported(&self, i: u32) -> f32 {
-        let (neighbors, weights) = self.edges(i);
-        neighbors.iter().zip(weights).filter(|&(&j, _)| self.is_alive(j)).map(|(_, &w)| w).sum()
+    /// The support of all nodes.
+    #[must_use]
+    pub fn supports(&self) -> &[f32] {
+        &self.support
     }
 
-    /// Number of correspondences.
+    fn supported(&self, node: u32) -> f32 {
+        let (neighbors, weights) = self.edges(node);
+        neighbors.iter().zip(weights).map(|(&j, &w)| if self.is_alive(j) { w } else { 0.0 }).sum()
+    }
+
+    /// Number of nodes.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.starts.len().saturating_sub(1)
+        self.ids.len()
     }
 
-    /// Whether there is no correspondence.
+    /// Whether there is no node.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.len() == 0
+        self.ids.is_empty()
     }
 
-    /// Neighbours of i and the weights of the edges to them.
+    /// The correspondence of a node.
     #[must_use]
-    pub fn edges(&self, i: u32) -> (&[u32], &[f32]) {
-        let range = self.starts[i as usize]..self.starts[i as usize + 1];
+    pub fn id(&self, node: u32) -> u32 {
+        self.ids[node as usize]
+    }
+
+    /// The node of a correspondence, if it has become one.
+    #[must_use]
+    pub fn node(&self, id: u32) -> Option<u32> {
+        Some(self.nodes[id as usize]).filter(|&node| node != NONE)
+    }
+
+    /// Neighbours of a node and the weights of the edges to them.
+    #[must_use]
+    pub fn edges(&self, node: u32) -> (&[u32], &[f32]) {
+        let range = self.starts[node as usize]..self.starts[node as usize + 1];
         (&self.neighbors[range.clone()], &self.weights[range])
-    }
-
-    /// Edges weighed by w_ij = 1 - (r / tau)^2.
-    fn first_order(
-        pairs: &Columns,
-        normals: Option<&PairNormals>,
-        test: &EdgeTest,
-        interrupted: &(impl Fn() -> bool + Sync),
-    ) -> Self {
-        let grid = Grid::new(&pairs.q, test.max_length);
-        let sorted = pairs.gather(grid.order());
-        let rows = par::map(pairs.len(), 16, |i| {
-            let (p, q) = pairs.pair(i);
-            let mut row = Vec::new();
-            if interrupted() {
-                return row;
-            }
-            for run in grid.around(q) {
-                sorted.for_compatible(run, p, q, test, |at, weight| {
-                    let j = grid.order()[at];
-                    let fits = |n: &PairNormals| n.compatible(i, j as usize, pairs, test.normal_tolerance);
-                    if normals.is_none_or(fits) {
-                        row.push((j, weight));
-                    }
-                });
-            }
-            row.sort_unstable_by_key(|&(j, _)| j);
-            row
-        });
-        let mut starts = vec![0];
-        starts.extend(rows.iter().scan(0, |sum, row| {
-            *sum += row.len();
-            Some(*sum)
-        }));
-        let (neighbors, weights) = rows.into_iter().flatten().unzip();
-        Self { starts, neighbors, weights, ..Self::default() }
-    }
-
-    /// w2_ij = w_ij * sum over k of w_ik w_kj, edge by edge.
-    fn second_order(&self, interrupted: &(impl Fn() -> bool + Sync)) -> Vec<f32> {
-        /// Rows that share one dense scratch row.
-        const BLOCK: usize = 64;
-        let n = self.len();
-        let blocks = par::map(n.div_ceil(BLOCK), 1, |block| {
-            let mut dense = vec![0.0_f32; n];
-            let mut out = Vec::new();
-            for i in block * BLOCK..((block + 1) * BLOCK).min(n) {
-                let (neighbors, weights) = self.edges(i as u32);
-                if interrupted() {
-                    out.resize(out.len() + neighbors.len(), 0.0);
-                    continue;
-                }
-                for (&k, &w) in neighbors.iter().zip(weights) {
-                    dense[k as usize] = w;
-                }
-                for (&j, &w) in neighbors.iter().zip(weights) {
-                    let (theirs, w_kj) = self.edges(j);
-                    let common: f32 = theirs.iter().zip(w_kj).map(|(&k, &w)| dense[k as usize] * w).sum();
-                    out.push(w * common);
-                }
-                for &k in neighbors {
-                    dense[k as usize] = 0.0;
-                }
-            }
-            out
-        });
-        blocks.into_iter().flatten().collect()
     }
 }
 
-impl Columns {
-    /// Calls `found(at, weight)` for each pair `at` of `run` that is compatible with (p, q).
-    fn for_compatible(
-        &self,
-        run: std::ops::Range<usize>,
-        p: [f32; 3],
-        q: [f32; 3],
-        test: &EdgeTest,
-        mut found: impl FnMut(usize, f32),
-    ) {
-        /// Weights computed at a time: few of them are positive, so they are looked through afterwards.
-        const CHUNK: usize = 64;
-        let inv_tau = 1.0 / test.tau;
-        let mut weights = [0.0_f32; CHUNK];
-        for start in run.clone().step_by(CHUNK) {
-            let n = CHUNK.min(run.end - start);
-            let [px, py, pz] = self.p.each_ref().map(|c| &c[start..start + n]);
-            let [qx, qy, qz] = self.q.each_ref().map(|c| &c[start..start + n]);
-            let out = &mut weights[..n];
-            for i in 0..n {
-                let a = norm(px[i] - p[0], py[i] - p[1], pz[i] - p[2]);
-                let b = norm(qx[i] - q[0], qy[i] - q[1], qz[i] - q[2]);
-                let u = (a - b) * inv_tau;
-                let fine = a > test.min_length && b > test.min_length && b < test.max_length;
-                out[i] = if fine { 1.0 - u * u } else { 0.0 };
+/// Each edge once, at its lower node: rows of later neighbours, ascending.
+struct Edges {
+    starts: Vec<usize>,
+    neighbors: Vec<u32>,
+    weights: Vec<f32>,
+}
+
+impl Edges {
+    fn len(&self) -> usize {
+        self.starts.len() - 1
+    }
+
+    fn row(&self, i: usize) -> (Range<usize>, &[u32], &[f32]) {
+        let range = self.starts[i]..self.starts[i + 1];
+        (range.clone(), &self.neighbors[range.clone()], &self.weights[range])
+    }
+
+    /// Second order: w2_ij = w_ij * sum over k of w_ik w_kj.
+    fn weigh_by_common_neighbors(&mut self, interrupted: &(impl Fn() -> bool + Sync)) {
+        /// Steps of the inner loop that make a part worth its memory, and parts at most. They depend on the graph and
+        /// not on the threads: so do the sums.
+        const STEPS: usize = 1 << 19;
+        const MAX_PARTS: usize = 8;
+        let degree = |j: u32| self.starts[j as usize + 1] - self.starts[j as usize];
+        let steps: Vec<usize> =
+            (0..self.len()).map(|i| self.row(i).1.iter().map(|&j| degree(j)).sum()).collect();
+        let total: usize = steps.iter().sum();
+        let num_parts = total.div_ceil(STEPS).clamp(1, MAX_PARTS);
+        let mut bounds = vec![0];
+        let mut sum = 0;
+        for (i, steps) in steps.iter().enumerate() {
+            sum += steps;
+            if sum * num_parts >= total * bounds.len() && bounds.len() < num_parts {
+                bounds.push(i + 1);
             }
-            for (i, &weight) in out.iter().enumerate() {
-                if weight > 0.0 {
-                    found(start + i, weight);
+        }
+        bounds.push(self.len());
+        let parts =
+            par::map(bounds.len() - 1, 1, |part| self.common(bounds[part]..bounds[part + 1], interrupted));
+        for (at, weight) in self.weights.iter_mut().enumerate() {
+            *weight *= parts.iter().map(|part| part[at]).sum::<f32>();
+        }
+    }
+
+    /// For each edge the sum of w_ik w_kj over those common neighbours k that make a triangle with it whose lowest node
+    /// is one of `lowest`. Each triangle is found once, at its lowest edge, and adds to all its three edges.
+    fn common(&self, lowest: Range<usize>, interrupted: &impl Fn() -> bool) -> Vec<f32> {
+        let mut common = vec![0.0_f32; self.neighbors.len()];
+        // w_ik, and the sum over j between i and k of w_ij w_jk: by k, for one i.
+        let (mut weight_to, mut between) = (vec![0.0_f32; self.len()], vec![0.0_f32; self.len()]);
+        for i in lowest {
+            if interrupted() {
+                return common;
+            }
+            let (range, neighbors, weights) = self.row(i);
+            for (&k, &w) in neighbors.iter().zip(weights) {
+                weight_to[k as usize] = w;
+            }
+            for (at_ij, (&j, &w_ij)) in range.clone().zip(neighbors.iter().zip(weights)) {
+                let (range, third, w_third) = self.row(j as usize);
+                let mut sum = 0.0;
+                for ((&k, &w_jk), common_jk) in third.iter().zip(w_third).zip(&mut common[range]) {
+                    let w_ik = weight_to[k as usize];
+                    sum += w_ik * w_jk;
+                    *common_jk += w_ij * w_ik;
+                    // Most k are no neighbours of i: a product with 0 costs less than a wrong guess.
+                    between[k as usize] += if w_ik > 0.0 { w_ij * w_jk } else { 0.0 };
                 }
+                common[at_ij] += sum;
             }
+            for (at_ik, &k) in range.zip(neighbors) {
+                common[at_ik] += between[k as usize];
+                (weight_to[k as usize], between[k as usize]) = (0.0, 0.0);
+            }
+        }
+        common
+    }
+
+    /// The graph with full rows. Nodes are visited in ascending order, so each row is filled from left to right, its
+    /// lower half first.
+    fn mirrored(&self) -> Graph {
+        let mut degrees: Vec<usize> = self.starts.windows(2).map(|w| w[1] - w[0]).collect();
+        for &j in &self.neighbors {
+            degrees[j as usize] += 1;
+        }
+        let mut starts = Vec::with_capacity(degrees.len() + 1);
+        starts.push(0);
+        for degree in degrees {
+            starts.push(starts[starts.len() - 1] + degree);
+        }
+        let num = 2 * self.neighbors.len();
+        let (mut neighbors, mut weights) = (vec![0; num], vec![0.0; num]);
+        let mut next = starts.clone();
+        for i in 0..self.len() {
+            let (_, mine, w) = self.row(i);
+            let at = next[i];
+            neighbors[at..at + mine.len()].copy_from_slice(mine);
+            weights[at..at + w.len()].copy_from_slice(w);
+            for (&j, &w) in mine.iter().zip(w) {
+                let at = &mut next[j as usize];
+                (neighbors[*at], weights[*at]) = (i as u32, w);
+                *at += 1;
+            }
+        }
+        Graph { starts, neighbors, weights, ..Graph::default() }
+    }
+}
+
+/// Finds the edges of each correspondence. Places are positions in the order of the grid.
+struct Finder<'a> {
+    /// In the order of the grid.
+    pairs: Columns,
+    /// By correspondence.
+    normals: Option<&'a PairNormals>,
+    grid: &'a Grid,
+    test: &'a EdgeTest,
+}
+
+/// Rows of the graph one after the other.
+#[derive(Default)]
+struct Rows {
+    lens: Vec<u32>,
+    neighbors: Vec<u32>,
+    weights: Vec<f32>,
+}
+
+impl Finder<'_> {
+    /// The nodes, and the edges weighed by w_ij = 1 - (r / tau)^2.
+    fn find(&self, interrupted: &(impl Fn() -> bool + Sync)) -> (Vec<u32>, Edges) {
+        let cells: Vec<_> = self.grid.neighborhoods(self.test.max_length).collect();
+        let degrees = par::map(cells.len(), 4, |cell| self.estimated_degrees(&cells[cell]));
+        let is_node = thinned(&degrees.concat(), self.test.max_degree);
+        let thins = is_node.contains(&false);
+        let upper = par::map(cells.len(), 4, |cell| {
+            let (home, runs) = &cells[cell];
+            let nodes = home.clone().filter(|&place| is_node[place]);
+            let mut rows = Rows::default();
+            if interrupted() {
+                rows.lens = vec![0; nodes.count()];
+            } else {
+                // Only what comes later in the order: the graph is symmetric.
+                let later = runs.iter().map(|run| run.start.max(home.start)..run.end.max(home.start));
+                let vicinity = if thins {
+                    Vicinity::new(&self.pairs, later.flatten().filter(|&place| is_node[place]))
+                } else {
+                    Vicinity::of_runs(&self.pairs, &later)
+                };
+                vicinity.push_rows(self, nodes, &mut rows);
+            }
+            rows
+        });
+        self.assemble(&upper, &is_node)
+    }
+
+    /// About how many neighbours each correspondence of a cell has; 0 where the vicinity is too small for it to matter.
+    fn estimated_degrees(&self, (home, runs): &(Range<usize>, Vec<Range<usize>>)) -> Vec<f32> {
+        /// So many of the vicinity are looked at: a degree is good to a fifth.
+        const SAMPLE: usize = 128;
+        let num: usize = runs.iter().map(Range::len).sum();
+        if num <= 2_usize.saturating_mul(self.test.max_degree as usize) {
+            return vec![0.0; home.len()];
+        }
+        let step = num.div_ceil(SAMPLE);
+        let mut vicinity = Vicinity::new(&self.pairs, runs.iter().cloned().flatten().step_by(step));
+        let scale = num as f32 / num.div_ceil(step) as f32;
+        let degrees = home.clone().map(|place| {
+            vicinity.join(self.pairs.pair(place), self.test, 0);
+            let mut hits = 0_u32;
+            vicinity.each_joined(0, |at| {
+                hits += u32::from(self.normals_fit(place, vicinity.places[at] as usize));
+            });
+            hits as f32 * scale
+        });
+        degrees.collect()
+    }
+
+    /// Whether the normals at two places allow an edge.
+    fn normals_fit(&self, place: usize, other: usize) -> bool {
+        self.normals.is_none_or(|normals| {
+            let [i, j] = [place, other].map(|place| self.grid.order()[place] as usize);
+            normals.compatible((i, j), (place, other), &self.pairs, self.test.normal_tolerance)
+        })
+    }
+
+    /// The nodes, and their rows one after the other, in which places become nodes.
+    fn assemble(&self, rows: &[Rows], is_node: &[bool]) -> (Vec<u32>, Edges) {
+        let ids = self.grid.order().iter().zip(is_node).filter(|&(_, &is_node)| is_node).map(|(&id, _)| id);
+        let ids: Vec<u32> = ids.collect();
+        let mut starts = vec![0];
+        for &len in rows.iter().flat_map(|rows| &rows.lens) {
+            starts.push(starts[starts.len() - 1] + len as usize);
+        }
+        let num = starts[starts.len() - 1];
+        let (mut neighbors, mut weights) = (Vec::with_capacity(num), Vec::with_capacity(num));
+        for rows in rows {
+            neighbors.extend_from_slice(&rows.neighbors);
+            weights.extend_from_slice(&rows.weights);
+        }
+        if ids.len() < is_node.len() {
+            let nodes = is_node.iter().scan(0, |next, &is_node| {
+                *next += u32::from(is_node);
+                Some(*next - u32::from(is_node))
+            });
+            let nodes: Vec<u32> = nodes.collect();
+            for place in &mut neighbors {
+                *place = nodes[*place as usize];
+            }
+        }
+        (ids, Edges { starts, neighbors, weights })
+    }
+}
+
+/// What can be joined to the correspondences of one cell, copied together and filled up to whole vectors: the runs of
+/// the grid are short, and the ends of so many loops would take longer than the loops.
+struct Vicinity {
+    places: Vec<u32>,
+    /// p and q.
+    coords: [Vec<f32>; 6],
+    /// Whether there is an edge: 0 or 1.
+    is_edge: Vec<u8>,
+}
+
+/// What a vicinity is filled up to a multiple of.
+const LANES: usize = 64;
+
+impl Vicinity {
+    fn new(pairs: &Columns, places: impl Iterator<Item = usize>) -> Self {
+        let mut places: Vec<u32> = places.map(|place| place as u32).collect();
+        let len = places.len().next_multiple_of(LANES);
+        let coords =
+            [&pairs.p[0], &pairs.p[1], &pairs.p[2], &pairs.q[0], &pairs.q[1], &pairs.q[2]].map(|axis| {
+                let mut column = Vec::with_capacity(len);
+                column.extend(places.iter().map(|&place| axis[place as usize]));
+                // Infinitely far from everything.
+                column.resize(len, f32::INFINITY);
+                column
+            });
+        places.resize(len, NONE);
+        Self { places, coords, is_edge: vec![0; len] }
+    }
+
+    /// The same for whole runs, copied piece by piece.
+    fn of_runs(pairs: &Columns, runs: &(impl Iterator<Item = Range<usize>> + Clone)) -> Self {
+        let mut places: Vec<u32> = runs.clone().flat_map(|run| run.start as u32..run.end as u32).collect();
+        let len = places.len().next_multiple_of(LANES);
+        let coords =
+            [&pairs.p[0], &pairs.p[1], &pairs.p[2], &pairs.q[0], &pairs.q[1], &pairs.q[2]].map(|axis| {
+                let mut column = Vec::with_capacity(len);
+                runs.clone().for_each(|run| column.extend_from_slice(&axis[run]));
+                column.resize(len, f32::INFINITY);
+                column
+            });
+        places.resize(len, NONE);
+        Self { places, coords, is_edge: vec![0; len] }
+    }
+
+    /// Sets which of the vicinity, from position `first` on, are joined to (p, q).
+    fn join(&mut self, (p, q): ([f32; 3], [f32; 3]), test: &EdgeTest, first: usize) {
+        let (coords, is_edge) =
+            (self.coords.each_ref().map(|axis| &axis[first..]), &mut self.is_edge[first..]);
+        simd(
+            #[inline(always)]
+            move || join(coords, is_edge, p, q, test),
+        );
+    }
+
+    /// Tells `found` the positions that the last [`Self::join`] has found, from `first` on (a multiple of `LANES`).
+    #[inline]
+    fn each_joined(&self, first: usize, mut found: impl FnMut(usize)) {
+        let blocks = self.is_edge[first..].as_chunks::<LANES>().0;
+        for (block, flags) in blocks.iter().enumerate() {
+            let mut bits = bits(flags);
+            while bits != 0 {
+                found(first + LANES * block + bits.trailing_zeros() as usize);
+                bits &= bits - 1;
+            }
+        }
+    }
+
+    /// Adds the rows of `nodes`: the neighbours that come later in the order.
+    fn push_rows(mut self, finder: &Finder<'_>, nodes: impl Iterator<Item = usize>, rows: &mut Rows) {
+        let inv_tau_sq = 1.0 / (finder.test.tau * finder.test.tau);
+        for place in nodes {
+            let (p, q) = finder.pairs.pair(place);
+            let before = rows.neighbors.len();
+            let first = self.places.partition_point(|&other| other as usize <= place) / LANES * LANES;
+            self.join((p, q), finder.test, first);
+            self.each_joined(first, |at| {
+                let other = self.places[at] as usize;
+                if other > place && finder.normals_fit(place, other) {
+                    let [a, b] = [(p, 0), (q, 3)].map(|(x, axis)| {
+                        let [dx, dy, dz] = [0, 1, 2].map(|k| self.coords[axis + k][at] - x[k]);
+                        (dx * dx + dy * dy + dz * dz).sqrt()
+                    });
+                    rows.neighbors.push(other as u32);
+                    // Rounding may put an edge at the very bound.
+                    rows.weights.push((1.0 - (a - b) * (a - b) * inv_tau_sq).max(f32::MIN_POSITIVE));
+                }
+            });
+            rows.lens.push((rows.neighbors.len() - before) as u32);
         }
     }
 }
 
+/// Tells of each pair of `coords` whether there is an edge to (p, q). Without a root: with A = a^2, B = b^2 the test
+/// |a - b| < tau is A + B - tau^2 < 2ab, that is: the left side is negative, or its square less than 4AB.
 #[inline(always)]
-#[allow(clippy::inline_always)] // the body of a loop that must vectorise
-fn norm(x: f32, y: f32, z: f32) -> f32 {
-    (x * x + y * y + z * z).sqrt()
+#[allow(clippy::inline_always, clippy::needless_bitwise_bool)] // a loop that must vectorise, so without branches
+fn join(coords: [&[f32]; 6], is_edge: &mut [u8], p: [f32; 3], q: [f32; 3], test: &EdgeTest) {
+    let n = is_edge.len();
+    let [px, py, pz, qx, qy, qz] = coords.map(|axis| &axis[..n]);
+    let [tau_sq, least_sq, most_sq] = [test.tau, test.min_length, test.max_length].map(|x| x * x);
+    for i in 0..n {
+        let (dx, dy, dz) = (px[i] - p[0], py[i] - p[1], pz[i] - p[2]);
+        let a_sq = dx * dx + dy * dy + dz * dz;
+        let (dx, dy, dz) = (qx[i] - q[0], qy[i] - q[1], qz[i] - q[2]);
+        let b_sq = dx * dx + dy * dy + dz * dz;
+        let left = a_sq + b_sq - tau_sq;
+        let agrees = (left < 0.0) | (left * left < 4.0 * a_sq * b_sq);
+        is_edge[i] = u8::from(agrees & (a_sq > least_sq) & (b_sq > least_sq) & (b_sq < most_sq));
+    }
+}
+
+/// One bit for each flag of 0 or 1.
+fn bits(flags: &[u8; LANES]) -> u64 {
+    // The product moves the low bits of eight bytes side by side into the highest byte.
+    let eight = |flags: &[u8; 8]| u64::from_le_bytes(*flags).wrapping_mul(0x0102_0408_1020_4080) >> 56;
+    flags.as_chunks::<8>().0.iter().enumerate().fold(0, |bits, (k, flags)| bits | eight(flags) << (8 * k))
+}
+
+/// Which places become nodes: of those with too many neighbours (as estimated) about as many as leave each
+/// `max_degree`, evenly spread over the places, which are in the order of the grid.
+fn thinned(degrees: &[f32], max_degree: u32) -> Vec<bool> {
+    let most = max_degree as f32;
+    let mut credit = 0.5;
+    let is_node = degrees.iter().map(|&degree| {
+        if degree <= most {
+            return true;
+        }
+        credit += most / degree;
+        let keep = credit >= 1.0;
+        credit -= f32::from(u8::from(keep));
+        keep
+    });
+    is_node.collect()
 }
 
 impl PairNormals {
@@ -258,10 +544,16 @@ impl PairNormals {
 
     /// Whether n_i.n_j, n_i.d and n_j.d agree on both sides, d being the unit vector from i to j: all that a
     /// rigid motion keeps of two oriented points beside their distance (Drost et al. 2010 use them as a feature).
-    /// Without orientation their magnitudes must.
-    fn compatible(&self, i: usize, j: usize, pairs: &Columns, tolerance: f32) -> bool {
+    /// Without orientation their magnitudes must. The two are given by correspondence and by their rows in `pairs`.
+    fn compatible(
+        &self,
+        (i, j): (usize, usize),
+        (row_i, row_j): (usize, usize),
+        pairs: &Columns,
+        tolerance: f32,
+    ) -> bool {
         let side = |n: &[Vector3<f32>], c: &[Vec<f32>; 3]| {
-            let d = Vector3::new(c[0][j] - c[0][i], c[1][j] - c[1][i], c[2][j] - c[2][i]).normalize();
+            let d = Vector3::from([0, 1, 2].map(|axis| c[axis][row_j] - c[axis][row_i])).normalize();
             [n[i].dot(&n[j]), n[i].dot(&d), n[j].dot(&d)].map(|cos| up_to_sign(cos, self.oriented))
         };
         let (p, q) = (side(&self.source, &pairs.p), side(&self.target, &pairs.q));

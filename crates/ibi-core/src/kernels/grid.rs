@@ -5,46 +5,69 @@ use std::ops::Range;
 /// Points sorted by cell, so that the points of a column of cells stand together.
 #[derive(Debug)]
 pub struct Grid {
-    origin: [f32; 3],
+    low: [f32; 3],
     inv_cell: f32,
+    /// Cells per axis.
     shape: [usize; 3],
     /// Start of each cell in `order`, plus the end.
     starts: Vec<u32>,
     order: Vec<u32>,
 }
 
-/// Cells per axis at most; beyond it cells grow. Bounds the memory to 4 * 64^3 bytes = 1 MiB.
-const MAX_CELLS: f32 = 64.0;
+/// Cells at most: as many as four times the points, or this many. Beyond it cells grow.
+const MIN_CELLS: usize = 1 << 12;
+const CELLS_PER_POINT: usize = 4;
+
+/// The part of a sorted sample that is cut off at either end before the box is taken, and how much of its width is
+/// then added on each side.
+const TAIL: usize = 50;
+const MARGIN: f32 = 0.25;
+const SAMPLE: usize = 1000;
 
 impl Grid {
-    /// Sorts `points` into cells at least `radius` wide.
+    /// Sorts `points` into cells of at least `cell`.
+    ///
+    /// The cells cover the box that holds nearly all of a sample of the points. What lies outside counts to the cells
+    /// on the rim, so that one stray point a kilometre away does not make all others share a cell.
+    ///
+    /// # Complexity
+    /// O(n) time; 4 bytes a point and at most 16 a point (or 16 KiB) for the cells.
     #[must_use]
-    pub fn new(points: &[Vec<f32>; 3], radius: f32) -> Self {
-        let bounds = points.each_ref().map(|c| {
-            c.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), &x| (lo.min(x), hi.max(x)))
-        });
-        let widest = bounds.iter().map(|(lo, hi)| hi - lo).fold(0.0, f32::max);
-        // A little wider than the radius, so that rounding cannot push a neighbour two cells away.
-        let cell = (radius * 1.001).max(widest / MAX_CELLS).max(f32::MIN_POSITIVE);
-        let origin = bounds.map(|(lo, _)| lo);
-        let inv_cell = 1.0 / cell;
-        let shape = bounds.map(|(lo, hi)| if hi >= lo { ((hi - lo) * inv_cell) as usize + 1 } else { 1 });
+    pub fn new(points: &[Vec<f32>; 3], cell: f32) -> Self {
         let n = points[0].len();
-        let mut grid = Self { origin, inv_cell, shape, starts: Vec::new(), order: Vec::new() };
-        let cells: Vec<usize> =
-            (0..n).map(|i| grid.index(grid.cell(points.each_ref().map(|c| c[i])))).collect();
-        let mut starts = vec![0_u32; shape.iter().product::<usize>() + 1];
+        let bounds = points.each_ref().map(|axis| bulk(axis));
+        let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
+        let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
+        let mut cell = cell.max(widest / max_cells as f32).max(f32::MIN_POSITIVE);
+        let shape_of = |cell: f32| bounds.map(|(low, high)| ((high - low) / cell) as usize + 1);
+        while shape_of(cell)
+            .iter()
+            .try_fold(1_usize, |all, &n| all.checked_mul(n))
+            .is_none_or(|c| c > max_cells)
+        {
+            cell *= 1.2;
+        }
+        let mut grid = Self {
+            low: bounds.map(|(low, _)| low),
+            inv_cell: 1.0 / cell,
+            shape: shape_of(cell),
+            starts: Vec::new(),
+            order: Vec::new(),
+        };
+        let cells: Vec<u32> =
+            (0..n).map(|i| grid.index(grid.cell(points.each_ref().map(|axis| axis[i]))) as u32).collect();
+        let mut starts = vec![0_u32; grid.shape.iter().product::<usize>() + 1];
         for &cell in &cells {
-            starts[cell + 1] += 1;
+            starts[cell as usize + 1] += 1;
         }
         for c in 1..starts.len() {
             starts[c] += starts[c - 1];
         }
         let mut next = starts.clone();
         let mut order = vec![0; n];
-        for (i, &cell) in cells.iter().enumerate() {
-            order[next[cell] as usize] = i as u32;
-            next[cell] += 1;
+        for (i, &cell) in (0_u32..).zip(&cells) {
+            order[next[cell as usize] as usize] = i;
+            next[cell as usize] += 1;
         }
         (grid.starts, grid.order) = (starts, order);
         grid
@@ -56,23 +79,135 @@ impl Grid {
         &self.order
     }
 
-    /// Ranges of [`Self::order`] that hold every point within the radius of `place` (a point of the grid).
-    pub fn around(&self, place: [f32; 3]) -> impl Iterator<Item = Range<usize>> + '_ {
-        let [x, y, z] = self.cell(place);
-        let near = |c: usize, axis: usize| c.saturating_sub(1)..=(c + 1).min(self.shape[axis] - 1);
-        near(x, 0).flat_map(move |x| near(y, 1).map(move |y| (x, y))).map(move |(x, y)| {
-            let (first, last) = (z.saturating_sub(1), (z + 1).min(self.shape[2] - 1));
-            self.starts[self.index([x, y, first])] as usize
-                ..self.starts[self.index([x, y, last]) + 1] as usize
+    /// Width of a cell.
+    #[must_use]
+    pub fn cell_size(&self) -> f32 {
+        1.0 / self.inv_cell
+    }
+
+    /// Ranges of [`Self::order`], ascending, that hold every point within `radius` of `place`, and others.
+    pub fn around(&self, place: [f32; 3], radius: f32) -> impl Iterator<Item = Range<usize>> + '_ {
+        // A little more than the radius: rounding must not lose a point at its very end.
+        let radius = radius + 1e-4 * radius + 1e-6 * place.iter().fold(0.0, |a: f32, x| a.max(x.abs()));
+        let low = self.cell(place.map(|x| x - radius));
+        let high = self.cell(place.map(|x| x + radius));
+        (low[0]..=high[0]).flat_map(move |x| {
+            let dx = self.gap(0, x, place[0]);
+            (low[1]..=high[1]).filter_map(move |y| {
+                let dy = self.gap(1, y, place[1]);
+                let left = radius * radius - dx * dx - dy * dy;
+                if left < 0.0 {
+                    return None;
+                }
+                let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
+                let first = self.along(2, place[2] - reach);
+                let last = self.along(2, place[2] + reach);
+                Some(self.starts[row + first] as usize..self.starts[row + last + 1] as usize)
+            })
         })
     }
 
-    fn cell(&self, p: [f32; 3]) -> [usize; 3] {
-        [0, 1, 2]
-            .map(|axis| (((p[axis] - self.origin[axis]) * self.inv_cell) as usize).min(self.shape[axis] - 1))
+    /// For each cell that holds points: its range of [`Self::order`], and, ascending, those that hold every point within
+    /// `radius` of any of its points, and others. Cells follow each other in the order.
+    pub fn neighborhoods(&self, radius: f32) -> impl Iterator<Item = (Range<usize>, Vec<Range<usize>>)> + '_ {
+        let [nx, ny, nz] = self.shape;
+        let cells = (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])));
+        // In cells; a little more, for rounding.
+        let radius = radius * 1.001 * self.inv_cell;
+        cells.filter_map(move |cell| {
+            let index = self.index(cell);
+            let home = self.starts[index] as usize..self.starts[index + 1] as usize;
+            (!home.is_empty()).then(|| (home, self.around_cell(cell, radius)))
+        })
     }
 
+    /// As [`Self::neighborhoods`] for one cell; the radius in cells.
+    fn around_cell(&self, [x, y, z]: [usize; 3], radius: f32) -> Vec<Range<usize>> {
+        let most = radius.ceil() as usize;
+        let window = |c: usize, axis: usize| c.saturating_sub(most)..=(c + most).min(self.shape[axis] - 1);
+        // Between two cells lie all those that separate them.
+        let gap = |a: usize, b: usize| a.abs_diff(b).saturating_sub(1) as f32;
+        let mut runs = Vec::new();
+        for other_x in window(x, 0) {
+            for other_y in window(y, 1) {
+                let left = radius * radius - gap(x, other_x).powi(2) - gap(y, other_y).powi(2);
+                if left < 0.0 {
+                    continue;
+                }
+                let reach = left.sqrt() as usize + 1;
+                let row = self.index([other_x, other_y, 0]);
+                let (first, last) = (z.saturating_sub(reach), (z + reach).min(self.shape[2] - 1));
+                let run = self.starts[row + first] as usize..self.starts[row + last + 1] as usize;
+                if !run.is_empty() {
+                    runs.push(run);
+                }
+            }
+        }
+        runs
+    }
+
+    /// Ranges of [`Self::order`] that hold every point within half a cell (a little less) of `place`: of each axis two
+    /// neighbouring cells.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // the head of an inner loop
+    pub(crate) fn block(&self, place: [f32; 3]) -> [Range<usize>; 4] {
+        let [x, y, z] = [0, 1, 2].map(|axis| {
+            let at = (place[axis] - self.low[axis]) * self.inv_cell - 0.5;
+            let last = self.shape[axis] - 1;
+            // A cast of a negative number gives 0; below half a cell there is none before the first.
+            [(at as usize).min(last), ((at + 1.0) as usize).min(last)]
+        });
+        let run = |x: usize, y: usize| {
+            let row = self.index([x, y, 0]);
+            self.starts[row + z[0]] as usize..self.starts[row + z[1] + 1] as usize
+        };
+        // At the rim both cells of an axis may be one.
+        let none = 0..0;
+        let (two_x, two_y) = (x[0] != x[1], y[0] != y[1]);
+        [
+            run(x[0], y[0]),
+            if two_y { run(x[0], y[1]) } else { none.clone() },
+            if two_x { run(x[1], y[0]) } else { none.clone() },
+            if two_x && two_y { run(x[1], y[1]) } else { none },
+        ]
+    }
+
+    /// How far `x` is from the cells `c` of an axis: 0 within, and beyond the rim, whose cells have no end.
+    fn gap(&self, axis: usize, c: usize, x: f32) -> f32 {
+        let at = (x - self.low[axis]) * self.inv_cell;
+        let below = if c > 0 { c as f32 - at } else { 0.0 };
+        let above = if c + 1 < self.shape[axis] { at - (c + 1) as f32 } else { 0.0 };
+        // Rounding of the cell of a point and of this gap may differ.
+        (below.max(above) - 1e-3).max(0.0) / self.inv_cell
+    }
+
+    fn cell(&self, p: [f32; 3]) -> [usize; 3] {
+        [0, 1, 2].map(|axis| self.along(axis, p[axis]))
+    }
+
+    #[inline]
+    fn along(&self, axis: usize, x: f32) -> usize {
+        // A cast of a negative number gives 0.
+        (((x - self.low[axis]) * self.inv_cell) as usize).min(self.shape[axis] - 1)
+    }
+
+    #[inline]
     fn index(&self, [x, y, z]: [usize; 3]) -> usize {
         (x * self.shape[1] + y) * self.shape[2] + z
     }
+}
+
+/// The interval that holds the bulk of the values.
+fn bulk(values: &[f32]) -> (f32, f32) {
+    let (least, most) =
+        values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), &x| (lo.min(x), hi.max(x)));
+    if least > most {
+        return (0.0, 0.0);
+    }
+    let mut sample: Vec<f32> = values.iter().copied().step_by(values.len().div_ceil(SAMPLE)).collect();
+    sample.sort_unstable_by(f32::total_cmp);
+    let cut = sample.len() / TAIL;
+    let (low, high) = (sample[cut], sample[sample.len() - 1 - cut]);
+    let margin = MARGIN * (high - low);
+    ((low - margin).max(least), (high + margin).min(most))
 }

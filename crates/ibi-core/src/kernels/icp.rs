@@ -4,7 +4,7 @@
 use nalgebra::{Isometry3, Matrix6, Point3, Translation3, UnitQuaternion, Vector3, Vector6};
 
 use super::kabsch::rigid_fit;
-use super::neighbors::Neighbors;
+use super::nearby::Nearby;
 use super::overlap::{Contact, Place, Surface, places};
 
 /// Largest turn of one step, in radians: beyond it the linearisation is worth nothing.
@@ -13,38 +13,54 @@ const MAX_TURN_RAD: f64 = 0.2;
 /// Damping relative to the mean curvature: what the surface does not hold (a plane slides) stays where it is.
 const DAMPING: f64 = 1e-3;
 
-/// Polishes `start` in at most `steps` steps and returns the pose with the least cost among all it came by: the
+/// Polishes `start` until `stop` and returns the pose with the least cost among all it came by: the
 /// mean over the visible source points of min(d, distance)^2, d being the distance to the target (to its tangent
 /// planes where there are normals). So it is never worse than its start by its own measure.
 #[must_use]
 pub fn icp(
     source: &Surface<'_>,
     target: &Surface<'_>,
-    neighbors: &Neighbors,
+    nearby: &Nearby,
     start: &Isometry3<f64>,
     contact: &Contact,
-    steps: u32,
+    stop: Stop,
 ) -> Isometry3<f64> {
     let (mut pose, mut best) = (*start, (f64::INFINITY, *start));
-    for step in 0..=steps {
-        let places = places(source, target, neighbors, &pose, contact);
+    let mut has_come_to_rest = false;
+    for step in 0..=stop.steps {
+        let places = places(source, target, nearby, &pose, contact);
         let cost = cost(source, target, &pose, contact, &places);
         if cost < best.0 {
             best = (cost, pose);
         }
-        if step == steps {
+        if step == stop.steps || has_come_to_rest {
             break;
         }
         let next = match target.normals {
             Some(normals) => to_planes(source, target.points, normals, &pose, contact, &places),
             None => rigid_fit(on(&places).map(|(i, row)| (&source.points[i], &target.points[row]))),
         };
-        match next {
-            Some(next) => pose = next,
-            None => break,
-        }
+        let Some(next) = next else { break };
+        has_come_to_rest = is_same(&pose, &next, source, stop.shift * contact.distance);
+        pose = next;
     }
     best.1
+}
+
+/// When a refinement ends.
+#[derive(Debug, Clone, Copy)]
+pub struct Stop {
+    /// After so many steps.
+    pub steps: u32,
+    /// After a step that moves the source by less than this share of the contact distance.
+    pub shift: f64,
+}
+
+/// Whether two poses move the source less than `distance` apart.
+fn is_same(a: &Isometry3<f64>, b: &Isometry3<f64>, source: &Surface<'_>, distance: f64) -> bool {
+    let (Some(first), Some(last)) = (source.points.first(), source.points.last()) else { return true };
+    let middle = source.points[source.points.len() / 2];
+    [*first, middle, *last].iter().all(|p| (a * p - b * p).norm() < distance)
 }
 
 /// (source row, target row) of the points in contact.
@@ -87,17 +103,24 @@ fn to_planes(
     }
     // Turning about the centre of the contact keeps rotation and translation apart.
     let centre = on(places).map(|(i, _)| (pose * source.points[i]).coords).sum::<Vector3<f64>>() / num as f64;
-    let (mut hessian, mut gradient) = (Matrix6::zeros(), Vector6::zeros());
+    let (mut hessian, mut gradient) = ([[0.0; 6]; 6], [0.0; 6]);
     for (i, row) in on(places) {
         let moved = pose * source.points[i];
         let normal = normals[row];
         let turn = (moved.coords - centre).cross(&normal);
         // Rotation is measured in arcs of the contact distance, so that both halves have one scale.
         let turn = turn / contact.distance;
-        let jacobian = Vector6::new(turn.x, turn.y, turn.z, normal.x, normal.y, normal.z);
-        hessian += jacobian * jacobian.transpose();
-        gradient += jacobian * (moved - target[row]).dot(&normal);
+        let jacobian = [turn.x, turn.y, turn.z, normal.x, normal.y, normal.z];
+        let gap = (moved - target[row]).dot(&normal);
+        for (r, &j) in jacobian.iter().enumerate() {
+            gradient[r] += j * gap;
+            for (c, &k) in jacobian.iter().enumerate() {
+                hessian[r][c] += j * k;
+            }
+        }
     }
+    let mut hessian = Matrix6::from(hessian);
+    let gradient = Vector6::from(gradient);
     hessian += Matrix6::identity() * (DAMPING * hessian.trace() / 6.0);
     let step = -hessian.cholesky()?.solve(&gradient);
     let turn = Vector3::new(step[0], step[1], step[2]) / contact.distance;

@@ -3,6 +3,7 @@
 //! Public so that a stage of your own can be built from the same parts. Kernels trust their input (it was
 //! checked at the door, see [`crate::Registrar::begin`]) and give the same bits for any number of threads.
 
+pub mod by_target;
 pub mod columns;
 pub mod compatibility;
 pub mod evidence;
@@ -11,10 +12,12 @@ pub mod grid;
 pub mod icp;
 pub mod kabsch;
 pub mod mae;
+pub mod nearby;
 pub mod neighbors;
 pub mod otsu;
 pub mod overlap;
 pub mod par;
 pub mod replicator;
 pub mod rng;
+pub(crate) mod simd;
 pub mod triplets;

@@ -1,9 +1,11 @@
 //! How much of the model lies on the scene (Quan et al. 2018), and where.
 
+use std::ops::Range;
+
 use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::graph::up_to_sign;
-use super::neighbors::Neighbors;
+use super::nearby::Nearby;
 use super::par;
 use super::rng::Rng;
 
@@ -40,19 +42,31 @@ pub enum Place {
     On(u32),
 }
 
-/// Where each source point lies once the pose has moved it.
+/// Points whose nearest neighbours one thread looks up at a time: fewer are not worth waking another.
+const GRAIN: usize = 2048;
+
+/// Where each source point lies once the pose has moved it. `nearby` holds the target, within at least
+/// `contact.distance`.
 ///
 /// # Complexity
-/// O(|source| log |target|).
+/// O(|source|) for targets that fill a surface.
 #[must_use]
 pub fn places(
     source: &Surface<'_>,
     target: &Surface<'_>,
-    neighbors: &Neighbors,
+    nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
     contact: &Contact,
 ) -> Vec<Place> {
-    par::map(source.points.len(), 64, |i| place(source, target, neighbors, target_from_source, contact, i).0)
+    let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
+        let mut places = vec![Place::Hidden; rows.len()];
+        let first = rows.start;
+        each_place(source, target, nearby, target_from_source, contact, rows, |i, place, _| {
+            places[i - first] = place;
+        });
+        places
+    });
+    chunks.concat()
 }
 
 /// Mean over the visible source points of max(0, 1 - d / `contact.distance`), d being the distance to the nearest
@@ -60,27 +74,28 @@ pub fn places(
 /// in the place of a step: it tells a snug fit from a loose one.
 ///
 /// # Complexity
-/// O(|source| log |target|).
+/// As [`places`].
 #[must_use]
 pub fn fit(
     source: &Surface<'_>,
     target: &Surface<'_>,
-    neighbors: &Neighbors,
+    nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
     contact: &Contact,
-    claimed: Option<&[bool]>,
+    is_claimed: impl Fn(u32) -> bool + Sync,
 ) -> f64 {
-    let near = par::map(source.points.len(), 64, |i| {
-        match place(source, target, neighbors, target_from_source, contact, i) {
-            (Place::Hidden, _) => None,
-            (Place::On(row), dist_sq) if claimed.is_none_or(|claimed| !claimed[row as usize]) => {
-                Some(1.0 - dist_sq.sqrt() / contact.distance)
+    let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
+        let (mut visible, mut sum) = (0_u32, 0.0);
+        each_place(source, target, nearby, target_from_source, contact, rows, |_, place, distance| {
+            visible += 1;
+            if matches!(place, Place::On(row) if !is_claimed(row)) {
+                sum += 1.0 - distance / contact.distance;
             }
-            _ => Some(0.0),
-        }
+        });
+        (visible, sum)
     });
-    let visible = near.iter().flatten().count();
-    near.iter().flatten().sum::<f64>() / visible.max(1) as f64
+    let visible: u32 = chunks.iter().map(|(visible, _)| visible).sum();
+    chunks.iter().map(|(_, sum)| sum).sum::<f64>() / f64::from(visible.max(1))
 }
 
 /// The fit of a pose that only chance has put somewhere on the target: the mean of max(0, 1 - d / distance)
@@ -89,56 +104,62 @@ pub fn fit(
 pub fn chance_fit(
     source: &Surface<'_>,
     target: &Surface<'_>,
-    neighbors: &Neighbors,
+    nearby: &Nearby,
     contact: &Contact,
     mut rng: Rng,
     samples: usize,
 ) -> f64 {
     let contact = Contact { viewpoint: None, ..*contact };
-    let poses: Vec<(usize, Isometry3<f64>)> = (0..samples)
-        .map(|_| {
-            let [i, about] = [(); 2].map(|()| rng.below(source.points.len()));
-            let onto = target.points[rng.below(target.points.len())];
-            let rotation = rng.rotation();
-            let shift = onto - rotation * source.points[about];
-            (i, Isometry3::from_parts(shift.into(), rotation))
-        })
-        .collect();
-    let near = par::map(samples, 64, |s| {
-        let (i, pose) = &poses[s];
-        match place(source, target, neighbors, pose, &contact, *i) {
-            (Place::On(_), dist_sq) => 1.0 - dist_sq.sqrt() / contact.distance,
-            _ => 0.0,
-        }
-    });
-    near.iter().sum::<f64>() / samples.max(1) as f64
+    let mut sum = 0.0;
+    for _ in 0..samples {
+        let [i, about] = [(); 2].map(|()| rng.below(source.points.len()));
+        let onto = target.points[rng.below(target.points.len())];
+        let rotation = rng.rotation();
+        let pose = Isometry3::from_parts((onto - rotation * source.points[about]).into(), rotation);
+        each_place(source, target, nearby, &pose, &contact, i..i + 1, |_, place, distance| {
+            if matches!(place, Place::On(_)) {
+                sum += 1.0 - distance / contact.distance;
+            }
+        });
+    }
+    sum / samples.max(1) as f64
 }
 
-/// Where source point i lies, and the squared distance to the target point nearest to it.
-fn place(
+/// Tells `found(i, place, distance)` of each visible source point i of `rows`: where it lies, and how far it is from
+/// the target point it lies on.
+fn each_place(
     source: &Surface<'_>,
     target: &Surface<'_>,
-    neighbors: &Neighbors,
+    nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
     contact: &Contact,
-    i: usize,
-) -> (Place, f64) {
-    let moved = target_from_source * source.points[i];
-    let normal = source.normals.map(|normals| target_from_source.rotation * normals[i]);
-    if let (Some(normal), Some(viewpoint), true) = (normal, contact.viewpoint, contact.oriented)
-        && normal.dot(&(viewpoint - moved)) <= 0.0
-    {
-        return (Place::Hidden, f64::INFINITY);
-    }
-    let Some((row, dist_sq)) = neighbors.nearest(&moved) else { return (Place::Free, f64::INFINITY) };
-    let agrees = match (normal, target.normals) {
-        (Some(normal), Some(normals)) => {
-            up_to_sign(normal.dot(&normals[row as usize]), contact.oriented) >= contact.min_normal_cos
+    rows: Range<usize>,
+    mut found: impl FnMut(usize, Place, f64),
+) {
+    let rotation = target_from_source.rotation.to_rotation_matrix();
+    let shift = target_from_source.translation.vector;
+    let facing = contact.viewpoint.filter(|_| contact.oriented).zip(source.normals);
+    let visible = rows.filter_map(|i| {
+        let moved = rotation * source.points[i] + shift;
+        let is_hidden =
+            facing.is_some_and(|(eye, normals)| (rotation * normals[i]).dot(&(eye - moved)) <= 0.0);
+        (!is_hidden).then_some((i, moved))
+    });
+    let normals = source.normals.zip(target.normals);
+    nearby.nearest_each(visible, |i, moved, row| {
+        let on =
+            row.map(|row| (row, (moved - target.points[row as usize]).norm())).filter(|&(row, distance)| {
+                let agree = |(n, m): (&[Vector3<f64>], &[Vector3<f64>])| {
+                    up_to_sign((rotation * n[i]).dot(&m[row as usize]), contact.oriented)
+                        >= contact.min_normal_cos
+                };
+                distance <= contact.distance && normals.is_none_or(agree)
+            });
+        match on {
+            Some((row, distance)) => found(i, Place::On(row), distance),
+            None => found(i, Place::Free, f64::INFINITY),
         }
-        _ => true,
-    };
-    let is_on = dist_sq <= contact.distance * contact.distance && agrees;
-    (if is_on { Place::On(row) } else { Place::Free }, dist_sq)
+    });
 }
 
 /// Share of the visible source points that lie on the target; 0 if none is visible.

@@ -56,6 +56,26 @@ fn share(n: usize, grain: usize) -> bool {
     n > grain && rayon::current_thread_index().is_some() && rayon::current_num_threads() > 1
 }
 
+/// Whether there is a second thread to share work with.
+#[must_use]
+pub fn is_parallel() -> bool {
+    share(1, 0)
+}
+
+#[cfg(not(feature = "rayon"))]
+fn share(_n: usize, _grain: usize) -> bool {
+    false
+}
+
+/// Both results; in parallel where there is a second thread.
+pub fn join<A: Send, B: Send>(a: impl FnOnce() -> A + Send, b: impl FnOnce() -> B + Send) -> (A, B) {
+    #[cfg(feature = "rayon")]
+    if is_parallel() {
+        return rayon::join(a, b);
+    }
+    (a(), b())
+}
+
 /// `(0..n).map(f)`, collected in order; threads take at least `grain` items at a time.
 pub fn map<T: Send>(n: usize, grain: usize, f: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
     #[cfg(feature = "rayon")]
@@ -65,6 +85,16 @@ pub fn map<T: Send>(n: usize, grain: usize, f: impl Fn(usize) -> T + Sync + Send
     }
     let _ = grain;
     (0..n).map(f).collect()
+}
+
+/// What `f` makes of each chunk of `0..n`, in order. The chunks do not depend on the threads, and so neither do sums
+/// over them.
+pub fn chunks<T: Send>(
+    n: usize,
+    chunk: usize,
+    f: impl Fn(std::ops::Range<usize>) -> T + Sync + Send,
+) -> Vec<T> {
+    map(n.div_ceil(chunk), 1, |c| f(c * chunk..n.min((c + 1) * chunk)))
 }
 
 /// Calls `f(row, slice)` for each row of a row-major matrix; threads take at least `grain` rows at a time.

@@ -1,31 +1,99 @@
 //! Discrete replicator dynamics (Eq. 2; Rodola et al. 2013).
 
-use super::columns::dot;
+use super::columns::{LANES, dot};
 use super::par;
+use super::simd::simd;
 
 /// Shares below this are extinct. Left to decay, they would reach the subnormal floats, which are slow; with
 /// payoffs of at least 1e-14 no product does.
 const EXTINCT: f32 = 1e-20;
 
+/// What n players gain from each other: a square matrix in rows of whole vectors.
+#[derive(Debug, Clone)]
+pub struct Payoffs {
+    n: usize,
+    stride: usize,
+    values: Vec<f32>,
+}
+
+impl Payoffs {
+    /// n players that gain nothing.
+    #[must_use]
+    pub fn zeros(n: usize) -> Self {
+        // At least one value more than n: see `padding`.
+        let stride = (n + 1).next_multiple_of(LANES);
+        Self { n, stride, values: vec![0.0; n * stride] }
+    }
+
+    /// The payoffs in `values`, row by row, n each.
+    #[must_use]
+    pub fn from_rows(n: usize, values: &[f32]) -> Self {
+        let mut payoffs = Self::zeros(n);
+        for (row, values) in payoffs.padded_rows().zip(values.chunks_exact(n.max(1))) {
+            row[..n].copy_from_slice(values);
+        }
+        payoffs
+    }
+
+    /// Number of players.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.n
+    }
+
+    /// Whether there is no player.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.n == 0
+    }
+
+    /// What player i gains from each.
+    #[must_use]
+    pub fn row(&self, i: usize) -> &[f32] {
+        &self.values[i * self.stride..][..self.n]
+    }
+
+    /// The rows with all their values: those beyond n play no part, whatever they are.
+    pub(crate) fn padded_rows(&mut self) -> impl Iterator<Item = &mut [f32]> {
+        self.values.chunks_exact_mut(self.stride)
+    }
+
+    /// A column of the padded rows that plays no part.
+    pub(crate) fn padding(&self) -> usize {
+        self.n
+    }
+
+    /// Sets the rows to what `fill(i, row)` makes of them, in parallel.
+    pub(crate) fn fill(&mut self, grain: usize, fill: impl Fn(usize, &mut [f32]) + Sync + Send) {
+        let n = self.n;
+        par::for_rows(&mut self.values, self.stride, grain, |i, row| fill(i, &mut row[..n]));
+    }
+}
+
 /// The population after exactly `steps` synchronous steps x_i <- x_i (Pi x)_i / x^T Pi x from the uniform
-/// population 1/n. `payoff` is row-major n x n. `None` once x^T Pi x is 0: nobody supports anybody.
+/// population 1/n. `None` once x^T Pi x is 0: nobody supports anybody.
 ///
 /// `interrupted` is asked before every step; the population as it is then comes back.
 ///
 /// # Complexity
 /// O(steps n^2).
-pub fn replicator(
-    payoff: &[f32],
-    n: usize,
-    steps: usize,
-    interrupted: impl Fn() -> bool,
-) -> Option<Vec<f32>> {
+pub fn replicator(payoffs: &Payoffs, steps: usize, interrupted: impl Fn() -> bool) -> Option<Vec<f32>> {
+    let Payoffs { n, stride, ref values } = *payoffs;
     let mut x = vec![1.0 / n as f32; n];
+    x.resize(stride, 0.0);
     for _ in 0..steps {
         if interrupted() {
             break;
         }
-        let fitness = par::map(n, 64, |i| dot(&payoff[i * n..(i + 1) * n], &x));
+        let fitness = par::chunks(n, GRAIN, |rows| {
+            let rows = &values[rows.start * stride..rows.end * stride];
+            let x = &x[..];
+            simd(
+                #[inline(always)]
+                move || rows.chunks_exact(stride).map(|row| dot(row, x)).collect::<Vec<f32>>(),
+            )
+        });
+        let fitness = fitness.concat();
         let mean: f64 = x.iter().zip(&fitness).map(|(&x, &f)| f64::from(x) * f64::from(f)).sum();
         if mean <= 0.0 {
             return None;
@@ -35,5 +103,9 @@ pub fn replicator(
             *x = if next < EXTINCT { 0.0 } else { next };
         }
     }
+    x.truncate(n);
     Some(x)
 }
+
+/// Rows that one thread takes at a time.
+const GRAIN: usize = 256;

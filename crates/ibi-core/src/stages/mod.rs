@@ -16,10 +16,9 @@ use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
-use crate::kernels::mae::close_pairs;
 use crate::kernels::rng::Rng;
 use crate::params::{Params, Refine};
-use crate::scene::Scene;
+use crate::scene::{Claims, Detail, Scene};
 
 /// SCS: picks from the alive correspondences a few that are highly consistent with each other.
 pub trait SelectSeeds: Send + Sync {
@@ -44,6 +43,20 @@ pub trait Validate: Send + Sync {
     /// Accepted or rejected, with the measured value. Asked again at the end of a contest, also after the run was
     /// interrupted: unlike the other stages it must then still answer truly.
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict;
+
+    /// A verdict at a first glance, on a hypothesis that was polished only roughly: a rejection, if no closer look could
+    /// change it. By default there is none.
+    fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
+        let _ = (context, hypothesis);
+        None
+    }
+
+    /// Whether an accepted hypothesis is good enough to become an instance at once, without waiting for the end of the
+    /// contest. By default none is.
+    fn is_sure(&self, verdict: &Verdict) -> bool {
+        let _ = verdict;
+        false
+    }
 }
 
 /// What a stage sees of the run: the input, what is alive, the parameters, the round.
@@ -62,8 +75,8 @@ pub struct Context<'a> {
     /// Whether a correspondence may not lead a seed selection (again), by id: with removal `inliers`, the seeds
     /// of all rounds before.
     pub barred: &'a [bool],
-    /// Whether an accepted instance explains a scene point, by row of the target.
-    pub claimed: &'a [bool],
+    /// Which scene points accepted instances explain.
+    pub claims: Claims<'a>,
     /// The compatibility graph of all correspondences, built by the first stage that wants it.
     pub graph: &'a OnceLock<Graph>,
     /// What chance brings in this scene.
@@ -83,10 +96,10 @@ impl Context<'_> {
     /// both points must agree as well.
     #[must_use]
     pub fn inliers(&self, target_from_source: &Isometry3<f64>, distance_pr: f64) -> Vec<u32> {
-        let ids = self.alive.ids();
-        let close = close_pairs(self.alive.columns(), target_from_source, distance_pr);
-        let close = close.into_iter().map(|row| ids[row as usize]);
-        close.filter(|&id| self.normals_agree(id, target_from_source)).collect()
+        let mut inliers = self.pairs.by_target.close_pairs(target_from_source, distance_pr);
+        inliers.retain(|&id| self.alive.contains(id) && self.normals_agree(id, target_from_source));
+        inliers.sort_unstable();
+        inliers
     }
 
     /// Alive correspondences that an accepted pose uses up: its inliers within 2 `t_he`, and those, right or
@@ -94,56 +107,68 @@ impl Context<'_> {
     #[must_use]
     pub fn spent(&self, target_from_source: &Isometry3<f64>) -> Vec<u32> {
         let mut spent = self.inliers(target_from_source, 2.0 * self.params.t_he_pr);
-        spent.extend(self.near(self.params.d_op_pr, target_from_source).map(|(id, ..)| id));
+        spent.extend(
+            self.near(Detail::Look, self.params.d_op_pr, target_from_source)
+                .found
+                .into_iter()
+                .map(|(id, ..)| id),
+        );
         spent.sort_unstable();
         spent.dedup();
         spent
     }
 
-    /// Alive correspondences whose target point lies within `distance_pr` of the moved source, ascending, each with
-    /// the row of the nearest source point and the distance in data units.
-    fn near(
-        &self,
-        distance_pr: f64,
-        target_from_source: &Isometry3<f64>,
-    ) -> impl Iterator<Item = (u32, u32, f64)> {
-        let ids = self.alive.ids();
-        let targets: Vec<_> = ids.iter().map(|&id| self.pairs.target[id as usize]).collect();
-        let nearest = self.scene.nearest_source(distance_pr, target_from_source, &targets);
-        ids.iter()
-            .zip(nearest)
-            .filter_map(|(&id, nearest)| nearest.map(|(row, distance)| (id, row, distance)))
+    /// Alive correspondences whose target point lies within `distance_pr` of the moved source, each with the row of the
+    /// nearest source point and the distance in data units. At a glance only some: every so many-th of those around.
+    fn near(&self, detail: Detail, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Near {
+        let scene = self.scene;
+        let radius = 0.5 * scene.source.extent + self.length(distance_pr);
+        let around = self.pairs.by_target.within(&(target_from_source * scene.source.centre), radius);
+        let ids: Vec<u32> = around.filter(|&id| self.alive.contains(id)).collect();
+        let step = match detail {
+            Detail::Glance => ids.len().div_ceil(GLANCE_NEAR).max(1),
+            Detail::Look => 1,
+        };
+        let targets = ids.iter().step_by(step).map(|&id| (id, self.pairs.target[id as usize]));
+        Near { found: scene.nearest_source(distance_pr, target_from_source, targets), step: step as u32 }
     }
 
     /// What speaks for a pose: the alive correspondences, and the scene points, if `exclusive` only those that no
     /// accepted instance has claimed.
     #[must_use]
-    pub fn support(&self, target_from_source: &Isometry3<f64>, exclusive: bool) -> Support {
-        let t_he = self.length(self.params.t_he_pr);
+    pub fn support(&self, detail: Detail, target_from_source: &Isometry3<f64>, exclusive: bool) -> Support {
         let chance = self.chance();
         let reach_pr = 2.0 * self.params.d_op_pr;
         let (reach, d_op) = (self.length(reach_pr), self.length(self.params.d_op_pr));
-        let (mut num_explained, mut num_agreeing, mut expected) = (0, 0, 0.0);
-        let (mut num_near, mut back_fit) = (0, 0.0);
-        for (id, row, distance) in self.near(reach_pr, target_from_source) {
-            num_near += 1;
-            back_fit += 1.0 - distance / reach;
-            if distance > d_op {
-                continue;
+        let t_he = self.length(self.params.t_he_pr);
+        let Near { found: near, step } = self.near(detail, reach_pr, target_from_source);
+        let back_fit = near.iter().map(|&(_, _, distance)| 1.0 - distance / reach).sum::<f64>();
+        let explained = near.iter().filter(|&&(_, _, distance)| distance <= d_op);
+        let expected: f64 =
+            explained.clone().map(|&(_, row, _)| f64::from(chance.agreement[row as usize])).sum();
+        let num_explained = explained.clone().count();
+        let num_agreeing = match detail {
+            // The agreeing ones are few and found by themselves.
+            Detail::Glance => {
+                self.inliers(target_from_source, self.params.t_he_pr.min(self.params.d_op_pr)).len()
             }
-            num_explained += 1;
-            expected += f64::from(chance.agreement[row as usize]);
-            let (p, q) = (self.pairs.source[id as usize], self.pairs.target[id as usize]);
-            let is_close = (target_from_source * p - q).norm_squared() < t_he * t_he;
-            num_agreeing += u32::from(is_close && self.normals_agree(id, target_from_source));
-        }
-        let fit = self.scene.fit(self.params, target_from_source, exclusive.then_some(self.claimed));
+            Detail::Look => explained
+                .filter(|&&(id, ..)| {
+                    let (p, q) = (self.pairs.source[id as usize], self.pairs.target[id as usize]);
+                    let is_close = (target_from_source * p - q).norm_squared() < t_he * t_he;
+                    is_close && self.normals_agree(id, target_from_source)
+                })
+                .count(),
+        };
+        let fit = self
+            .scene
+            .fit(self.params, detail, target_from_source, |row| exclusive && self.claims.contains(row));
         Support {
-            num_explained,
-            num_agreeing,
-            chance: expected / f64::from(num_explained.max(1)),
+            num_explained: (num_explained as u32 * step).max(num_agreeing as u32),
+            num_agreeing: num_agreeing as u32,
+            chance: expected / num_explained.max(1) as f64,
             fit,
-            back_fit: back_fit / f64::from(num_near.max(1)),
+            back_fit: back_fit / near.len().max(1) as f64,
             chance_fit: chance.fit,
             one_sided: self.scene.is_one_sided(self.params),
         }
@@ -169,13 +194,10 @@ impl Context<'_> {
     /// away from its correspondences, so that fewer than `t_s` alive ones still agree: the clouds alone fit flat
     /// faces almost anywhere.
     #[must_use]
-    pub fn refined(&self, hypothesis: Hypothesis) -> Option<Hypothesis> {
+    pub fn refined(&self, detail: Detail, hypothesis: Hypothesis) -> Option<Hypothesis> {
         let target_from_source = match self.params.refine {
             Refine::None => return None,
-            Refine::Icp if self.scene.is_hopeless(self.params, &hypothesis.target_from_source) => {
-                return None;
-            }
-            Refine::Icp => self.scene.icp(self.params, &hypothesis.target_from_source),
+            Refine::Icp => self.scene.icp(self.params, detail, &hypothesis.target_from_source),
         };
         let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
         let is_supported = support >= self.params.t_s as usize;
@@ -188,6 +210,16 @@ impl Context<'_> {
         Rng::new(self.params.seed, self.round, stage as u32)
     }
 }
+
+/// Correspondences near a pose: the id of each, the row of the source point nearest to its target point, and their
+/// distance; and how many each of them stands for.
+struct Near {
+    found: Vec<(u32, u32, f64)>,
+    step: u32,
+}
+
+/// Correspondences near a pose that are looked at for a glance.
+const GLANCE_NEAR: usize = 128;
 
 /// What chance brings in a scene.
 #[derive(Debug)]

@@ -1,10 +1,11 @@
 use crate::error::Error;
-use crate::kernels::compatibility::votes;
+use crate::kernels::by_target::ball;
+use crate::kernels::compatibility::{vote_reach, votes};
 use crate::params::at_least_3;
 use crate::stages::{Context, Enhance, Ranked};
 
 /// `voting`: every seed votes for every alive correspondence by their consistency; the `n_vot` with the most
-/// votes are `C_d` (Eq. 5-6; Yang et al. 2019). Seeds are candidates too.
+/// votes are `C_d` (Eq. 5-6; Yang et al. 2019). Seeds are candidates too; who has no vote is none.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(
     feature = "serde",
@@ -30,8 +31,19 @@ impl Voting {
 
 impl Enhance for Voting {
     fn enhance(&self, context: &Context<'_>, seeds: &Ranked) -> Ranked {
+        let delta_r = context.params.delta_r_pr;
+        let by_target = &context.pairs.by_target;
         let voters = context.pairs.columns.gather(seeds.ids());
-        let votes = votes(context.alive.columns(), &voters, context.params.delta_r_pr);
-        Ranked::best_of(context.alive.ids().iter().copied().zip(votes).collect(), self.n_vot as usize)
+        // Whose target point lies farther from that of a seed than their source points can be apart has no vote from it.
+        let reach = by_target.source_diameter() + vote_reach(delta_r);
+        let (centre, spread) = ball(&voters.q);
+        let runs = by_target.around(centre, spread + reach).flatten();
+        let (ids, places): (Vec<u32>, Vec<u32>) = runs
+            .map(|at| (by_target.id(at), at as u32))
+            .filter(|&(id, _)| context.alive.contains(id))
+            .unzip();
+        let votes = votes(&by_target.sorted().gather(&places), &voters, delta_r);
+        let voted = ids.into_iter().zip(votes).filter(|&(_, votes)| votes > 0.0);
+        Ranked::best_of(voted.collect(), self.n_vot as usize)
     }
 }

@@ -35,4 +35,18 @@ impl Validate for Hv {
             Self::None(none) => none.validate(context, hypothesis),
         }
     }
+
+    fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
+        match self {
+            Self::Evidence(evidence) => evidence.glance(context, hypothesis),
+            _ => Option::None,
+        }
+    }
+
+    fn is_sure(&self, verdict: &Verdict) -> bool {
+        match self {
+            Self::Evidence(evidence) => evidence.is_sure(verdict),
+            _ => false,
+        }
+    }
 }

@@ -39,7 +39,7 @@ impl Validate for Overlap {
         let mut places = context.scene.places(context.params, &hypothesis.target_from_source);
         if self.exclusive {
             for place in &mut places {
-                if matches!(place, Place::On(row) if context.claimed[*row as usize]) {
+                if matches!(place, Place::On(row) if context.claims.contains(*row)) {
                     *place = Place::Free;
                 }
             }

@@ -52,8 +52,7 @@ impl SelectSeeds for Gtm {
         let players = context.pairs.columns.gather(&sample);
         let payoff =
             payoff_matrix(&players, self.payoff, context.params.delta_r_pr, || context.interrupt.is_set());
-        let generations = self.n_gtm as usize;
-        let population = replicator(&payoff, sample.len(), generations, || context.interrupt.is_set());
+        let population = replicator(&payoff, self.n_gtm as usize, || context.interrupt.is_set());
         let Some(population) = population else { return Ranked::default() };
         // Equal shares have no threshold: nothing is to be told apart, so all are seeds.
         let t_gtm = otsu(&population, OTSU_BINS).unwrap_or(0.0);

@@ -1,17 +1,19 @@
 use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 
 use super::gtm::OTSU_BINS;
 use crate::error::Error;
 use crate::kernels::graph::{EdgeTest, Graph};
 use crate::kernels::otsu::otsu;
-use crate::kernels::replicator::replicator;
-use crate::params::{at_least_1, non_negative, positive};
+use crate::kernels::replicator::{Payoffs, replicator};
+use crate::params::{at_least_1, at_least_8, non_negative, positive};
 use crate::stages::{Context, Ranked, SelectSeeds};
 
 /// Neighbourhoods of so few cannot be split by a histogram: seeds are those above a share of the largest.
 const FEW: usize = 8;
 const FEW_SHARE: f32 = 0.3;
+
+/// With the leader play at most so many of its neighbours, those with the largest weights.
+const MAX_OTHERS: usize = 63;
 
 /// `local_gtm`: the game of `gtm`, played by the neighbourhood of one correspondence at a time in the
 /// second-order compatibility graph of *all* correspondences.
@@ -34,13 +36,24 @@ pub struct LocalGtm {
     pub normal_tolerance: f64,
     /// Whether an edge is weighed by what its two ends have in common, or by its own rigidity alone.
     pub second_order: bool,
+    /// Where correspondences have more compatible ones than this around them, only so many of them take part that they
+    /// have about as many. Bounds time and memory, and keeps those down that are compatible with all and sundry. At
+    /// least 8.
+    pub max_degree: u32,
     /// `N_gtm`: generations of the replicator. At least 1.
     pub n_gtm: u32,
 }
 
 impl Default for LocalGtm {
     fn default() -> Self {
-        Self { tau_pr: 1.0, min_length_pr: 1.0, normal_tolerance: 0.5, second_order: true, n_gtm: 20 }
+        Self {
+            tau_pr: 0.9,
+            min_length_pr: 1.0,
+            normal_tolerance: 0.5,
+            second_order: true,
+            max_degree: 80,
+            n_gtm: 20,
+        }
     }
 }
 
@@ -49,6 +62,7 @@ impl LocalGtm {
         positive("scs.tau_pr", self.tau_pr)?;
         non_negative("scs.min_length_pr", self.min_length_pr)?;
         positive("scs.normal_tolerance", self.normal_tolerance)?;
+        at_least_8("scs.max_degree", self.max_degree)?;
         at_least_1("scs.n_gtm", self.n_gtm)
     }
 
@@ -60,87 +74,127 @@ impl LocalGtm {
             max_length: (diameter_pr + self.tau_pr) as f32,
             normal_tolerance: self.normal_tolerance as f32,
             second_order: self.second_order,
+            max_degree: self.max_degree,
         };
         let interrupted = || context.interrupt.is_set();
         let mut graph =
             Graph::new(&context.pairs.columns, context.pairs.normals.as_ref(), &test, interrupted);
         // In the first round everything is alive; a stage of the user's may have begun the run, though.
-        if context.alive.ids().len() < graph.len() {
+        let num_pairs = context.pairs.len();
+        if context.alive.ids().len() < num_pairs {
             let is_dead = |id: &u32| context.alive.ids().binary_search(id).is_err();
-            graph.remove(&(0..graph.len() as u32).filter(is_dead).collect::<Vec<_>>());
+            graph.remove(&(0..num_pairs as u32).filter(is_dead).collect::<Vec<_>>());
         }
         graph
     }
 
     /// The seeds among `leader` and its alive neighbours.
     fn play(&self, context: &Context<'_>, graph: &Graph, leader: u32) -> Ranked {
-        let (neighbors, _) = graph.edges(leader);
-        let mut players: Vec<u32> =
-            neighbors.iter().copied().filter(|&j| graph.is_alive(j)).chain([leader]).collect();
+        let (neighbors, weights) = graph.edges(leader);
+        let mut others: Vec<(u32, u32)> = neighbors
+            .iter()
+            .zip(weights)
+            .filter(|&(&j, _)| graph.is_alive(j))
+            .map(|(&j, w)| (w.to_bits(), j))
+            .collect();
+        if others.len() > MAX_OTHERS {
+            // Weights are not negative: their bits order them.
+            others.select_nth_unstable_by_key(MAX_OTHERS, |&other| Reverse(other));
+            others.truncate(MAX_OTHERS);
+        }
+        let mut players: Vec<u32> = others.into_iter().map(|(_, j)| j).chain([leader]).collect();
         players.sort_unstable();
-        let payoff = payoffs(graph, &players);
-        let generations = self.n_gtm as usize;
         let interrupted = || context.interrupt.is_set();
-        let Some(population) = replicator(&payoff, players.len(), generations, interrupted) else {
-            return Ranked::default();
-        };
+        let population = replicator(&payoffs(graph, &players), self.n_gtm as usize, interrupted);
+        let Some(population) = population else { return Ranked::default() };
         let t_gtm = if players.len() > FEW {
             otsu(&population, OTSU_BINS).unwrap_or(0.0)
         } else {
             FEW_SHARE * population.iter().copied().fold(0.0, f32::max)
         };
         // The leader is a seed whatever its share: barred with the others, it cannot lead to them again.
-        let is_seed = |&(i, x): &(u32, f32)| x > t_gtm || i == leader;
-        Ranked::new(players.into_iter().zip(population).filter(is_seed).collect())
+        let is_seed = |&(node, x): &(u32, f32)| x > t_gtm || node == leader;
+        let seeds = players.into_iter().zip(population).filter(is_seed);
+        Ranked::new(seeds.map(|(node, x)| (graph.id(node), x)).collect())
     }
 }
 
-/// Row-major second-order payoffs of `players` with each other.
-fn payoffs(graph: &Graph, players: &[u32]) -> Vec<f32> {
-    const NONE: u32 = u32::MAX;
-    let n = players.len();
-    // Looking a neighbour's column up beats walking the two sorted lists side by side four to one.
-    let mut columns = vec![NONE; graph.len()];
+/// Second-order payoffs of `players` with each other.
+fn payoffs(graph: &Graph, players: &[u32]) -> Payoffs {
+    let mut payoffs = Payoffs::zeros(players.len());
+    // One column stands for all that do not play: whether a neighbour does is anybody's guess, and a store costs less
+    // than a wrong guess.
+    let mut columns = vec![payoffs.padding() as u32; graph.len()];
     for (column, &player) in (0_u32..).zip(players) {
         columns[player as usize] = column;
     }
-    let mut matrix = vec![0.0; n * n];
-    for (row, &i) in matrix.chunks_exact_mut(n).zip(players) {
+    for (row, &i) in payoffs.padded_rows().zip(players) {
         let (neighbors, weights) = graph.edges(i);
         for (&j, &w) in neighbors.iter().zip(weights) {
-            let column = columns[j as usize];
-            if column != NONE {
-                row[column as usize] = w;
-            }
+            row[columns[j as usize] as usize] = w;
         }
     }
-    matrix
+    payoffs
 }
 
 impl SelectSeeds for LocalGtm {
     fn select_seeds(&self, context: &Context<'_>) -> Ranked {
         let graph = context.graph.get_or_init(|| self.build(context));
-
-        let may_lead = |i: u32| !context.barred[i as usize] && !graph.is_futile(i) && graph.support(i) > 0.0;
-        // The first or second leader will do in most rounds, so they are not sorted. Supports are positive: their bits
-        // order them.
-        let key = |&i: &u32| (graph.support(i).to_bits(), Reverse(i));
-        let leaders = context.alive.ids().iter().filter(|&&i| may_lead(i)).map(key);
-        let mut leaders: BinaryHeap<_> = leaders.collect();
+        let is_free = |node: u32| graph.is_alive(node) && !context.barred[graph.id(node) as usize];
         let enough = context.params.t_s as usize;
-        let mut most = Ranked::default();
-        while let Some((_, Reverse(leader))) = leaders.pop() {
+        let mut leaders = Leaders::new(graph, |node| is_free(node) && graph.futile(node).is_none());
+        for leader in &mut leaders {
             let seeds = self.play(context, graph, leader);
             if seeds.len() >= enough || context.interrupt.is_set() {
                 return seeds;
             }
             // It gives way to the next, and would lose again as long as its neighbourhood stays the same. Without
             // this memory a scan's run played a hundred games a round (measured: 44,000 in 478 rounds).
-            graph.set_futile(leader);
-            if seeds.len() > most.len() {
-                most = seeds;
+            graph.set_futile(leader, seeds.len() as u32);
+        }
+        // None has enough: the one that comes nearest says by how much.
+        let all = (0..graph.len() as u32).filter(|&node| is_free(node));
+        let nearest = all.max_by_key(|&node| (graph.futile(node), leaders.key(node)));
+        nearest.map_or_else(Ranked::default, |leader| self.play(context, graph, leader))
+    }
+}
+
+/// The nodes that may lead, those with the most support first, ties by the lower correspondence. Each is looked for when
+/// it is asked for: in most rounds the first or second will do.
+struct Leaders<'a, F> {
+    graph: &'a Graph,
+    may_lead: F,
+    last: Key,
+}
+
+/// Support and, of equals, the lower correspondence; then the node. Supports are not negative: their bits order them.
+type Key = (u32, Reverse<u32>, u32);
+
+impl<'a, F: Fn(u32) -> bool> Leaders<'a, F> {
+    fn new(graph: &'a Graph, may_lead: F) -> Self {
+        Self { graph, may_lead, last: (u32::MAX, Reverse(0), 0) }
+    }
+
+    fn key(&self, node: u32) -> Key {
+        (self.graph.support(node).to_bits(), Reverse(self.graph.id(node)), node)
+    }
+}
+
+impl<F: Fn(u32) -> bool> Iterator for Leaders<'_, F> {
+    type Item = u32;
+
+    fn next(&mut self) -> Option<u32> {
+        let mut best: Key = (1, Reverse(u32::MAX), u32::MAX); // some support
+        for (node, support) in (0_u32..).zip(self.graph.supports()) {
+            // Few are better than all before them: the rest is seldom asked for.
+            if (best.0..=self.last.0).contains(&support.to_bits()) {
+                let key = self.key(node);
+                if key > best && key < self.last && (self.may_lead)(node) {
+                    best = key;
+                }
             }
         }
-        most
+        self.last = best;
+        (best.2 != u32::MAX).then_some(best.2)
     }
 }

@@ -2,7 +2,6 @@ use nalgebra::Isometry3;
 
 use crate::error::Error;
 use crate::kernels::kabsch::rigid_fit;
-use crate::kernels::mae::mae;
 use crate::params::{at_least_1, at_most};
 use crate::stages::{Context, Estimate, EstimatePose, Hypothesis, Ranked};
 
@@ -51,11 +50,17 @@ impl EstimatePose for Irls {
                     None => break,
                 }
             }
-            let score = mae(context.alive.columns(), &pose, context.params.t_he_pr);
-            Hypothesis { target_from_source: pose, score: f64::from(score) }
+            Hypothesis { target_from_source: pose, score: mae_of(context, &pose) }
         });
         Estimate { hypothesis, num_samples: 1, num_degenerate: u32::from(hypothesis.is_none()) }
     }
+}
+
+/// The MAE of a pose over the alive correspondences (Eq. 7-8), of which only those near it are looked at.
+fn mae_of(context: &Context<'_>, pose: &Isometry3<f64>) -> f64 {
+    let inliers = context.inliers(pose, context.params.t_he_pr);
+    let t_he = context.length(context.params.t_he_pr);
+    context.pairs.pairs(inliers).map(|(p, q)| (1.0 - (pose * p - q).norm() / t_he).max(0.0)).sum()
 }
 
 /// The fit to the alive correspondences within `distance_pr` of `pose`.
