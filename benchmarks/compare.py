@@ -1,4 +1,4 @@
-"""Registration against other programs, on the same correspondences: prints tables, writes a record and a plot.
+"""Registration against other programs on the same correspondences: prints tables, writes record and plot.
 
     python benchmarks/compare.py                       # or: make bench-peers
     python benchmarks/compare.py --layout fpfh --scenes 3 --repeats 1 --method "PCL GC"
@@ -88,7 +88,8 @@ class Run:
 
 def empty_row(layout: str, method: str, missing: str = "") -> dict[str, Any]:
     """Return the row of a method that did not run."""
-    keys = ("scene", "K", "M", "recall", "precision", "f1", "strict_f1", "poses", "seconds", "ratio", "repeats")
+    scores = ("recall", "precision", "f1", "strict_f1")
+    keys = ("scene", "K", "M", *scores, "poses", "seconds", "ratio", "repeats")
     return {
         "layout": layout,
         "method": method,
@@ -113,7 +114,13 @@ def check(methods: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
 def compare(
     layout: str, half: str, todo: Sequence[synth.Scene], versions: dict[str, str], repeats: int
 ) -> dict[str, list[Run]]:
-    """Run methods in turn on scene after scene, and all of it again; the runs by method, in order of the scenes."""
+    """Run methods in turn on scene after scene, and all of it again.
+
+    Returns
+    -------
+    dict
+        Of each method its runs, in the order of the scenes.
+    """
     prepared = {
         name: [METHODS[name].prepare(scene, settings(name, layout)) for scene in todo] for name in versions
     }
@@ -142,8 +149,9 @@ def compare(
 def print_table(layout: str, half: str, runs: dict[str, list[Run]], missing: dict[str, str]) -> None:
     """Print one layout: a line per method."""
     first = next(iter(runs.values()))
-    k, m = (np.mean([getattr(r.result, key) for r in first]) for key in ("inlier_share", "num_correspondences"))
-    head = f"{layout}, {half} half: {len(first)} scenes, {m:.0f} correspondences, {k:.2%} inliers"
+    inliers = np.mean([r.result.inlier_share for r in first])
+    m = np.mean([r.result.num_correspondences for r in first])
+    head = f"{layout}, {half} half: {len(first)} scenes, {m:.0f} correspondences, {inliers:.2%} inliers"
     print(f"\n{head}\n{'method':36s}  MHR    MHP    MHF1   strict poses        ms   x ours")
     for name, of_method in runs.items():
         loose = metrics.mean_score(r.result.one_to_one for r in of_method)
@@ -169,7 +177,7 @@ def draw(path: Path, by_layout: dict[str, dict[str, list[Run]]]) -> None:
     """MHF1 against the time, a panel for each layout."""
     figure = Figure(figsize=(4.2 * len(by_layout) + 2.6, 4.2), layout="constrained")
     panels = figure.subplots(1, len(by_layout), sharey=True, squeeze=False)[0]
-    markers, handles = "o s ^ D v P X < > * p h".split(), {}
+    markers, handles = "os^DvPX<>*ph", {}
     for panel, (layout, runs) in zip(panels, by_layout.items(), strict=True):
         for i, name in enumerate(METHODS):
             if name not in runs:
@@ -197,12 +205,12 @@ def tune(layout: str, todo: Sequence[synth.Scene], name: str) -> None:
     """Sweep the settings of a method, one after the other, and print each combination tried, best first.
 
     Begins with the settings as they are. Each one in turn takes the value of its sweep with the best MHF1,
-    among equals the fastest; twice around.
+    among equals the fastest, among those within a tenth or so the best by the strict score; twice around.
     """
-    tried: dict[tuple[Any, ...], tuple[float, float, float]] = {}
+    tried: dict[tuple[Any, ...], tuple[float, int, float, float]] = {}
 
-    def outcome(values: dict[str, Any]) -> tuple[float, float, float]:
-        """MHF1 with the sign turned, ms, strict MHF1: the least is the best."""
+    def outcome(values: dict[str, Any]) -> tuple[float, int, float, float]:
+        """Score the settings: the least is the best, so scores have their signs turned."""
         key = tuple(values.items())
         if key not in tried:
             results = []
@@ -214,15 +222,16 @@ def tune(layout: str, todo: Sequence[synth.Scene], name: str) -> None:
                 results.append(score(scene, poses, layout, "tuning", name, ms))
             loose = metrics.mean_score(r.one_to_one for r in results).mhf1
             strict = metrics.mean_score(r.strict for r in results).mhf1
-            tried[key] = -round(loose, 3), float(np.median([r.ms for r in results])), strict
+            ms = float(np.median([r.ms for r in results]))
+            tried[key] = -round(loose, 3), round(np.log(ms) / np.log(1.1)), -strict, ms
         return tried[key]
 
     best = settings(name, layout)
     for key, values in 2 * list(SWEEP[name].items()):
         best = min(({**best, key: value} for value in dict.fromkeys([best[key], *values])), key=outcome)
     print(f"\n{name}, {layout}, tuning half: {len(todo)} scenes\n MHF1  strict       ms  settings")
-    for tried_settings, (loose, ms, strict) in sorted(tried.items(), key=lambda item: item[1]):
-        print(f"{-loose:.3f}  {strict:.3f}  {ms:7.1f}  {dict(tried_settings)}", flush=True)
+    for values, (loose, _, strict, ms) in sorted(tried.items(), key=lambda item: item[1]):
+        print(f"{-loose:.3f}  {-strict:.3f}  {ms:7.1f}  {dict(values)}", flush=True)
 
 
 def main() -> None:
@@ -235,8 +244,12 @@ def main() -> None:
     parser.add_argument("--method", nargs="+", choices=METHODS, metavar="NAME", help="; ".join(METHODS))
     parser.add_argument("--scenes", type=int, default=10, help="of each layout")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--modelnet", type=Path, help=f"npz file: category/name -> (n, 3); adds {WITH_MODELNET}")
-    parser.add_argument("--tune", action="store_true", help="sweep the settings of the peers on the tuning half")
+    parser.add_argument(
+        "--modelnet", type=Path, help=f"npz file: category/name -> (n, 3); adds {WITH_MODELNET}"
+    )
+    parser.add_argument(
+        "--tune", action="store_true", help="sweep the settings of the peers on the tuning half"
+    )
     parser.add_argument(
         "--out",
         type=Path,
@@ -244,7 +257,9 @@ def main() -> None:
         "where the other options are not the default",
     )
     args = parser.parse_args()
-    usual = all(getattr(args, key) == parser.get_default(key) for key in ("half", "layout", "method", "scenes"))
+    usual = all(
+        getattr(args, key) == parser.get_default(key) for key in ("half", "layout", "method", "scenes")
+    )
     chosen = args.layout or [*LAYOUTS_RUN, *([WITH_MODELNET] if args.modelnet else [])]
     if args.modelnet is None and any(LAYOUTS[name].shapes == "modelnet" for name in chosen):
         parser.error("ModelNet layouts need --modelnet")

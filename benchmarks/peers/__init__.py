@@ -1,4 +1,4 @@
-"""Other programs that find poses, each in a file of its own behind one contract; run by benchmarks/compare.py.
+"""Other programs that find poses, each in a file of its own, behind one contract; see benchmarks/compare.py.
 
 A peer's module has two functions:
 

@@ -1,7 +1,7 @@
-"""The check that all peers share: is a pose's model seen in the scene, on points that no better pose has?
+"""The check that all peers share: a pose's model must be seen, on scene points that no better pose has.
 
-Grouping, RANSAC and voting return candidates, wrong ones among them and right ones more than once. The peers
-leave the choice to their users, so it is made here, in the same way for all.
+Grouping, RANSAC and voting return candidates, wrong ones among them and right ones more than once. The
+peers leave the choice to their users, so it is made here, in the same way for all.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class Claims:
 
     def __init__(self, model: NDArray[np.float64], scene: NDArray[np.float64], radius: float) -> None:
         self._model, self._radius = model, radius
-        self._tree = cKDTree(scene)
+        self._tree = cKDTree(scene, balanced_tree=False)
         self.free = np.ones(len(scene), dtype=bool)
 
     def keep(self, pose: NDArray[np.float64], least: float) -> bool:
         """Keep a pose, and claim its scene points, if more than the share `least` of its model is seen."""
         moved = move(pose, self._model)
-        # Cheap, and most wrong poses end here: seen at all, be it by claimed points.
-        near = np.isfinite(self._tree.query(moved, distance_upper_bound=self._radius)[0])
+        # Cheap, and many wrong poses end here: seen at all, be it by claimed points.
+        near = self._near(moved)
         if near.mean() <= least:
             return False
         pairs = cKDTree(moved[near]).sparse_distance_matrix(self._tree, self._radius, output_type="ndarray")
@@ -43,8 +43,20 @@ class Claims:
         self.free[pairs["j"]] = False
         return True
 
+    def plausible(self, poses: NDArray[np.float64], least: float) -> NDArray[np.bool_]:
+        """Mark the poses worth a check: every eighth model point is asked, for all poses at once.
+
+        The share of these may be three standard deviations below `least`.
+        """
+        few = self._model[::8]
+        moved = few @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+        return self._near(moved).mean(axis=1) > least - 1.5 / np.sqrt(len(few))
+
+    def _near(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.isfinite(self._tree.query(points, distance_upper_bound=self._radius)[0])
+
 
 def keep_best(poses: NDArray[np.float64], claims: Claims, least: float) -> NDArray[np.float64]:
     """Go through candidates, best first, and return those that `Claims.keep` keeps."""
-    kept = [pose for pose in poses if claims.keep(pose, least)]
+    kept = [pose for pose in poses[claims.plausible(poses, least)] if claims.keep(pose, least)]
     return np.array(kept).reshape(-1, 4, 4)

@@ -1,7 +1,7 @@
 """PCL: geometric consistency grouping, and Hough voting with BOARD reference frames.
 
-Through pcl.cpp, a small driver of ours, which `make bench-peers` compiles to _pcl.so against the system's PCL.
-It is loaded into this process; nothing runs beside the call.
+Through pcl.cpp, a small driver of ours, which `make bench-peers` compiles to _pcl.so against the PCL of the
+system. It is loaded into this process; nothing runs beside the call.
 
 H. Chen and B. Bhanu, "3D free-form object recognition in range images using local surface patches", PRL 2007.
 F. Tombari and L. Di Stefano, "Object recognition in 3D scenes with occlusions and clutter by Hough voting",
