@@ -15,7 +15,7 @@ from peers import METHODS, ecc, pcl  # noqa: E402
 from peers.contract import Missing, model_spacing  # noqa: E402
 from peers.overlap import Claims, keep_best  # noqa: E402
 from peers.sequence import in_sequence  # noqa: E402
-from peers.settings import FAMILIES, SETTINGS, SWEEP, settings  # noqa: E402
+from peers.settings import FAMILIES, SETTINGS, SWEEP, settings, table  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -193,3 +193,8 @@ def test_every_peer_has_settings_for_every_family():
         for values in SETTINGS[name].values():
             assert set(SWEEP[name]) <= set(values)
     assert settings("ECC", "ecc-0.02") is SETTINGS["ECC"]["ecc"]
+
+
+def test_the_documentation_has_these_settings():
+    page = (BENCHMARKS.parent / "docs/peers.md").read_text(encoding="utf-8")
+    assert table() in page, "paste what peers.settings.table() returns"

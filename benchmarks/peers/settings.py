@@ -15,35 +15,42 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "PCL GC": {
         "outlier": {"size_pr": 1.0, "threshold": 24, "refit": True},
         "ecc": {"size_pr": 0.3, "threshold": 8, "refit": True},
-        "fpfh": {"size_pr": 1.5, "threshold": 6, "refit": True},
+        "fpfh": {"size_pr": 2.0, "threshold": 8, "refit": True},
     },
     "PCL GC + check": {
-        "outlier": {"size_pr": 1.5, "threshold": 8, "refit": True, "least": 0.6},
-        "ecc": {"size_pr": 1.5, "threshold": 4, "refit": True, "least": 0.7},
+        "outlier": {"size_pr": 1.5, "threshold": 16, "refit": True, "least": 0.6},
+        "ecc": {"size_pr": 2.0, "threshold": 6, "refit": True, "least": 0.7},
         "fpfh": {"size_pr": 1.5, "threshold": 4, "refit": True, "least": 0.3},
     },
     "PCL Hough3D": {
         "outlier": {"bin_pr": 8.0, "threshold": 4.0, "frame_pr": 6.0, "neighbors": 24, "refit": True},
         "ecc": {"bin_pr": 4.0, "threshold": 8.0, "frame_pr": 4.0, "neighbors": 24, "refit": True},
-        "fpfh": {"bin_pr": 6.0, "threshold": 8.0, "frame_pr": 6.0, "neighbors": 12, "refit": True},
+        "fpfh": {"bin_pr": 8.0, "threshold": 12.0, "frame_pr": 12.0, "neighbors": 12, "refit": True},
     },
     "PCL Hough3D + check": {
         "outlier": {
             "bin_pr": 8.0, "threshold": 2.0, "frame_pr": 4.0, "neighbors": 12, "refit": True, "least": 0.4,
         },
         "ecc": {
-            "bin_pr": 3.0, "threshold": 4.0, "frame_pr": 6.0, "neighbors": 24, "refit": True, "least": 0.6,
+            "bin_pr": 3.0, "threshold": 4.0, "frame_pr": 9.0, "neighbors": 24, "refit": True, "least": 0.6,
         },
         "fpfh": {
-            "bin_pr": 6.0, "threshold": 4.0, "frame_pr": 6.0, "neighbors": 24, "refit": True, "least": 0.4,
+            "bin_pr": 12.0, "threshold": 6.0, "frame_pr": 4.0, "neighbors": 12, "refit": True, "least": 0.3,
         },
     },
     "Open3D RANSAC, sequence": {
-        f: {
+        "outlier": {
+            "inlier_pr": 2.5, "iterations": 100_000, "confidence": 0.999, "edge": 0.8,
+            "least": 0.4, "failures": 3,
+        },
+        "ecc": {
             "inlier_pr": 1.5, "iterations": 100_000, "confidence": 0.999, "edge": 0.9,
             "least": 0.5, "failures": 3,
-        }
-        for f in FAMILIES
+        },
+        "fpfh": {
+            "inlier_pr": 2.5, "iterations": 100_000, "confidence": 0.999, "edge": 0.9,
+            "least": 0.4, "failures": 10,
+        },
     },
     "KISS-Matcher, sequence": {
         "outlier": {"noise_pr": 1.0, "solver_gain": 0.75, "inlier_pr": 3.0, "least": 0.4, "failures": 3},
@@ -51,15 +58,23 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
         "fpfh": {"noise_pr": 1.5, "solver_gain": 1.0, "inlier_pr": 3.0, "least": 0.3, "failures": 3},
     },
     "OpenCV PPF + check": {
-        f: {
+        "outlier": {
+            "model_step": 0.02, "scene_step": 0.02, "every": 1, "neighbors": 24,
+            "candidates": 400, "least": 0.4,
+        },
+        "ecc": {
+            "model_step": 0.05, "scene_step": 0.02, "every": 5, "neighbors": 12,
+            "candidates": 100, "least": 0.6,
+        },
+        "fpfh": {
             "model_step": 0.03, "scene_step": 0.03, "every": 1, "neighbors": 12,
-            "candidates": 200, "least": 0.5,
-        }
-        for f in FAMILIES
+            "candidates": 400, "least": 0.5,
+        },
     },
     "ECC": {
-        f: {"samples": 1024, "inlier": 0.3, "t_merge": 0.2, "t_count": 0.5, "min_members": 10}
-        for f in FAMILIES
+        "outlier": {"samples": 1024, "inlier": 0.3, "t_merge": 0.4, "t_count": 0.5, "min_members": 10},
+        "ecc": {"samples": 1024, "inlier": 0.15, "t_merge": 0.2, "t_count": 0.5, "min_members": 10},
+        "fpfh": {"samples": 1024, "inlier": 0.3, "t_merge": 0.4, "t_count": 0.5, "min_members": 10},
     },
 }  # fmt: skip
 
@@ -83,7 +98,7 @@ SWEEP: dict[str, dict[str, list[Any]]] = {
     },
     "Open3D RANSAC, sequence": {
         "inlier_pr": [1.0, 1.5, 2.5], "edge": [0.8, 0.9, 0.95], "least": [0.3, 0.4, 0.5, 0.6],
-        "failures": [3, 10], "iterations": [100_000, 1_000_000],
+        "failures": [3, 10],
     },
     "KISS-Matcher, sequence": {
         "noise_pr": [0.25, 0.5, 1.0, 1.5, 2.0, 3.0], "inlier_pr": [1.0, 1.5, 3.0],
@@ -109,3 +124,12 @@ def family(layout: str) -> str:
 def settings(method: str, layout: str) -> dict[str, Any]:
     """Return the settings of a method; ours has none."""
     return SETTINGS[method][family(layout)] if method in SETTINGS else {}
+
+
+def table() -> str:
+    """Return all settings as the Markdown table of docs/peers.md."""
+    lines = [f"| method | {' | '.join(f'`{name}`' for name in FAMILIES)} |", "|---|---|---|---|"]
+    for method, by_family in SETTINGS.items():
+        cells = [", ".join(f"{key} {value}" for key, value in by_family[f].items()) for f in FAMILIES]
+        lines.append(f"| {method} | {' | '.join(cells)} |".replace("_", "\\_"))
+    return "\n".join(lines)
