@@ -44,12 +44,12 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
             "least": 0.4, "failures": 3,
         },
         "ecc": {
-            "inlier_pr": 1.5, "iterations": 100_000, "confidence": 0.999, "edge": 0.9,
-            "least": 0.5, "failures": 3,
+            "inlier_pr": 1.5, "iterations": 100_000, "confidence": 0.999, "edge": 0.8,
+            "least": 0.3, "failures": 3,
         },
         "fpfh": {
-            "inlier_pr": 2.5, "iterations": 100_000, "confidence": 0.999, "edge": 0.9,
-            "least": 0.4, "failures": 10,
+            "inlier_pr": 1.0, "iterations": 100_000, "confidence": 0.999, "edge": 0.9,
+            "least": 0.3, "failures": 3,
         },
     },
     "KISS-Matcher, sequence": {
@@ -67,7 +67,7 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
             "candidates": 100, "least": 0.6,
         },
         "fpfh": {
-            "model_step": 0.03, "scene_step": 0.03, "every": 1, "neighbors": 12,
+            "model_step": 0.03, "scene_step": 0.02, "every": 1, "neighbors": 12,
             "candidates": 400, "least": 0.5,
         },
     },
@@ -131,5 +131,5 @@ def table() -> str:
     lines = [f"| method | {' | '.join(f'`{name}`' for name in FAMILIES)} |", "|---|---|---|---|"]
     for method, by_family in SETTINGS.items():
         cells = [", ".join(f"{key} {value}" for key, value in by_family[f].items()) for f in FAMILIES]
-        lines.append(f"| {method} | {' | '.join(cells)} |".replace("_", "\\_"))
+        lines.append(f"| {method} | {' | '.join(cells)} |")
     return "\n".join(lines)
