@@ -195,7 +195,7 @@ def draw(path: Path, by_layout: dict[str, dict[str, list[Run]]]) -> None:
     FigureCanvasAgg(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    print(f"\nwrote {path}")
+    print(f"\nwrote {path.name}")
 
 
 # Tuning ---------------------------------------------------------------------------------------------------
