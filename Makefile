@@ -1,4 +1,5 @@
-# Each target sets up what it needs in .venv, beside this file. Nothing is installed anywhere else.
+# Each target sets up what it needs in .venv, beside this file. Nothing is installed anywhere else, but that
+# `bench-peers` asks apt-get for PCL where it may.
 # Stamp files in .venv/stamps remember what was done, so that a second run is quick.
 
 .DEFAULT_GOAL := help
@@ -24,7 +25,7 @@ unexport CONDA_PREFIX PYTHONHOME
 
 .PHONY: help
 help: ## list the targets
-	@awk -F':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+	@awk -F':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 .PHONY: demo
 demo: $(STAMPS)/package $(STAMPS)/group-demo ## register the example scenes and draw what was found
@@ -46,6 +47,10 @@ tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables, write 
 	$(BIN)/python benchmarks/accuracy.py
 	$(BIN)/python benchmarks/ablation.py
 	$(BIN)/python benchmarks/calibration.py
+
+.PHONY: bench-peers
+bench-peers: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## compare with PCL, Open3D, KISS-Matcher, OpenCV, ECC; ARGS=--help tells more
+	$(BIN)/python benchmarks/compare.py $(ARGS)
 
 .PHONY: lint
 lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs
@@ -69,7 +74,7 @@ wheel: cargo $(STAMPS)/venv ## build a wheel into dist
 .PHONY: clean
 clean: ## remove all that make has made
 	rm -rf $(VENV) target dist docs/_build .pytest_cache .mypy_cache .ruff_cache
-	rm -f python/ibi_rs/_core*.so python/ibi_rs/_core*.pyd
+	rm -f python/ibi_rs/_core*.so python/ibi_rs/_core*.pyd benchmarks/peers/_pcl.so
 	find python tests benchmarks examples docs -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # What the targets need ------------------------------------------------------------------------------------
@@ -103,3 +108,28 @@ $(STAMPS)/open3d: $(STAMPS)/group-bench
 	@$(BIN)/python -c 'import open3d' || { \
 		echo "make: Open3D cannot be loaded; on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1" >&2; exit 1; }
 	@touch $@
+
+# A peer that cannot be had is a row of the comparison that says so, and not the end of it.
+.PHONY: peers
+peers: $(STAMPS)/venv
+	@$(MAKE) --no-print-directory $(STAMPS)/group-peers || \
+		for peer in kiss-matcher opencv-contrib-python-headless; do \
+			$(PIP) $$peer || echo "make: $$peer cannot be installed; going on without it" >&2; done
+
+# The driver of PCL; benchmarks/peers/pcl.cpp tells why these flags.
+PCL_DRIVER := benchmarks/peers/_pcl.so
+PCL_FLAGS := -std=c++17 -O3 -march=native -DEIGEN_MAX_ALIGN_BYTES=16 -DPCL_NO_PRECOMPILE -DNDEBUG -w
+
+.PHONY: pcl
+pcl:
+	@pkg-config --exists pcl_recognition 2>/dev/null || if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "make: installing PCL and what it depends on with apt-get"; apt-get update -qq || true; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+			g++ pkg-config libpcl-dev >/dev/null || true; fi
+	@{ command -v $(CXX) && pkg-config --exists pcl_recognition; } >/dev/null 2>&1 || { \
+		echo "make: going on without PCL; it needs g++, pkg-config and, on Debian and Ubuntu, apt-get install libpcl-dev" >&2; \
+		exit 0; }; $(MAKE) --no-print-directory $(PCL_DRIVER) || echo "make: going on without PCL" >&2
+
+$(PCL_DRIVER): benchmarks/peers/pcl.cpp benchmarks/peers/pcl.map
+	$(CXX) $(PCL_FLAGS) $$(pkg-config --cflags pcl_recognition) -fPIC -shared -Wl,--no-undefined \
+		-Wl,--version-script=benchmarks/peers/pcl.map $< -o $@ -lpcl_recognition -lpcl_common -llz4

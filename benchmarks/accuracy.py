@@ -96,8 +96,15 @@ def register(scene: synth.Scene, params: ibi.Params, num_threads: int | None = N
     )
 
 
-def score(scene: synth.Scene, found: ibi.Registration, layout: str, half: str, params: str) -> Result:
-    """Score a registration in both families."""
+def score(
+    scene: synth.Scene,
+    found: ibi.Registration | np.ndarray,
+    layout: str,
+    half: str,
+    params: str,
+    ms: float | None = None,
+) -> Result:
+    """Score a registration, or the poses of another program and its time, in both families."""
     pr = float(np.mean(cKDTree(scene.src).query(scene.src, k=2)[0][:, 1]))
     in_family = partial(metrics.score_scene, found, scene.poses)
     strict = None
@@ -119,7 +126,7 @@ def score(scene: synth.Scene, found: ibi.Registration, layout: str, half: str, p
         one_to_one,
         free,
         strict,
-        1e3 * found.timings.total_s,
+        1e3 * found.timings.total_s if ms is None else ms,
     )
 
 

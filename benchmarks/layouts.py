@@ -93,6 +93,10 @@ LAYOUTS = {
     "outlier-50-70": Layout(outlier, {"outlier_ratio": (0.5, 0.7)}),
     "outlier-70-90": Layout(outlier, {"outlier_ratio": (0.7, 0.9)}),
     "outlier-90-99": Layout(outlier, {"outlier_ratio": (0.9, 0.99)}),
+    # Of one size, for times: benchmarks/compare.py.
+    "outlier-5000": Layout(
+        outlier, {"num_instances": 20, "num_correspondences": 5000, "outlier_ratio": (0.7, 0.9)}, 10
+    ),
     "outlier-inexact-70-90": Layout(outlier, {"outlier_ratio": (0.7, 0.9), "exact": False}),
     "outlier-inexact-90-99": Layout(outlier, {"outlier_ratio": (0.9, 0.99), "exact": False}),
     "starving": Layout(

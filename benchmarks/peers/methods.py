@@ -1,0 +1,34 @@
+"""What is run, in the order of the table."""
+
+from __future__ import annotations
+
+import ibi_rs as ibi
+from layouts import NO_NORMALS
+
+from . import ecc, kiss, open3d_ransac, opencv_ppf, ours, pcl
+from .contract import CORES, Method
+
+
+def _ours(params: ibi.Params, num_threads: int, *, needs_normals: bool = False) -> Method:
+    fixed: dict[str, object] = {"params": params, "num_threads": num_threads}
+    return Method(ours, num_threads, fixed, needs_normals)
+
+
+OURS = "ibi default, 1 thread"
+"""Times are compared with this one's."""
+
+METHODS = {
+    OURS: _ours(ibi.Params(), 1),
+    "ibi default, 2 threads": _ours(ibi.Params(), 2),
+    "ibi default, no normals, 2 threads": _ours(*NO_NORMALS.values(), 2, needs_normals=True),
+    "ibi paper_synthetic, 2 threads": _ours(ibi.Params.paper_synthetic(), 2),
+    "PCL GC": Method(pcl, 1, {"method": "gc", "least": None}),
+    "PCL GC + check": Method(pcl, 1, {"method": "gc"}),
+    "PCL Hough3D": Method(pcl, 1, {"method": "hough", "least": None}),
+    "PCL Hough3D + check": Method(pcl, 1, {"method": "hough"}),
+    "Open3D RANSAC, sequence": Method(open3d_ransac, CORES),
+    "KISS-Matcher, sequence": Method(kiss, CORES),
+    "OpenCV PPF + check": Method(opencv_ppf, CORES),
+    "ECC": Method(ecc, CORES),
+}
+"""Every method by the name of its row."""
