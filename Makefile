@@ -52,6 +52,10 @@ tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables, write 
 bench-peers: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## compare with PCL, Open3D, KISS-Matcher, OpenCV, ECC; ARGS=--help tells more
 	$(BIN)/python benchmarks/compare.py $(ARGS)
 
+.PHONY: bench-speed
+bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
+	$(BIN)/python benchmarks/speed.py
+
 .PHONY: lint
 lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs
 	cargo fmt --all --check
