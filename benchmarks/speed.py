@@ -56,7 +56,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Memory:
-    """Peak memory of a process in MB."""
+    """Peak memory of a process in MB, 2^20 bytes."""
 
     rise: float
     total: float
