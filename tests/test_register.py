@@ -644,3 +644,41 @@ def test_a_callback_may_register():
     inner = []
     register(max_instances=1, callback=lambda _: inner.append(register()))
     assert [content(found) for found in inner] == [content(FOUND)]
+
+
+# The model that is prepared once -----------------------------------------------------------------------------
+
+
+def test_a_model_finds_what_register_finds_and_again():
+    model = ibi.Model(SCENE.src)
+    for _ in range(2):
+        assert content(model.register(SCENE.tgt, SCENE.corr, PLAIN)) == content(RUNS["default"])
+    assert len(model) == len(SCENE.src)
+    assert model.spacing == pytest.approx(spacing(SCENE.src), rel=1e-6)
+    assert model.diameter == pytest.approx(metrics.diameter(SCENE.src))
+    assert "without normals" in repr(model)
+
+
+def test_a_model_with_normals_wants_those_of_the_scene_too():
+    normals = np.tile([0.0, 0.0, 2.0], (len(SCENE.src), 1))
+    model = ibi.Model(SCENE.src, normals=normals)
+    with pytest.raises(ibi.InputError, match="tgt_normals"):
+        model.register(SCENE.tgt, SCENE.corr)
+    with pytest.raises(ibi.InputError, match="src_normals"):
+        ibi.Model(SCENE.src, normals=normals[1:])
+
+
+def test_a_model_survives_a_pickle_and_changes_of_the_callers_arrays():
+    src = SCENE.src.copy()
+    model = ibi.Model(src)
+    src[:] = 0
+    for one in (model, pickle.loads(pickle.dumps(model))):
+        assert content(one.register(SCENE.tgt, SCENE.corr, PLAIN)) == content(RUNS["default"])
+        with pytest.raises(ValueError, match="read-only"):
+            one.points[0] = 0
+
+
+@pytest.mark.parametrize("src", [SCENE.src[:2], np.zeros((5, 3)), np.full((5, 3), np.nan), np.zeros((5, 2))])
+def test_a_model_of_bad_points_is_refused(src):
+    with pytest.raises(ibi.InputError, match="src"):
+        ibi.Model(src)

@@ -8,6 +8,7 @@ use crate::error::{Argument, Error};
 use crate::kernels::by_target::ByTarget;
 use crate::kernels::columns::Columns;
 use crate::kernels::graph::{PairNormals, up_to_sign};
+use crate::kernels::par;
 use crate::params::Params;
 use crate::scene::{PreparedCloud, Scene, check_points};
 
@@ -143,7 +144,7 @@ impl PointPairs {
             let near = scene.near_source.within(&source.points[row], t_he).filter(alike);
             near.map(|other| uses[other as usize]).sum::<u32>() as f32 / self.len().max(1) as f32
         };
-        (0..source.points.len()).map(chance).collect()
+        par::map(source.points.len(), 512, chance)
     }
 
     /// M, the number of correspondences.

@@ -254,6 +254,7 @@ impl<'a> Registrar<'a> {
         if !self.plays_ahead() || seeds.len() < self.params.t_s as usize {
             return self.play_seeds(&context, tried, seeds, timings);
         }
+        context.chance(); // not from within the two threads
         let barred = problem.also_barred(seeds.ids());
         let (now, next) = par::join(
             || self.play_seeds(&context, tried, seeds, timings),

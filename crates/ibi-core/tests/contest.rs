@@ -10,14 +10,17 @@
 mod common;
 
 use std::ops::ControlFlow;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use common::Mock;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::stages::te::Gsac;
-use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Verdict};
+use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
 use ibi_core::{
-    CancelToken, Cloud, Correspondences, Params, Registrar, Registration, Removal, Round, State, StopReason,
+    CancelToken, Cloud, Correspondences, Params, Refine, Registrar, Registration, Removal, Round, State,
+    StopReason,
 };
 use ibi_testkit::scenes::asymmetric_model;
 use ibi_testkit::{Rng, naive};
@@ -165,6 +168,71 @@ fn a_contest_keeps_to_max_instances() {
         let params = Params { max_instances: Some(2), max_rounds, ..contest(n_contest) };
         assert_eq!(sorted_places(&register(&planned(plan, params))), [40, 60]);
     }
+}
+
+// -------------------------------------------------------------------------------------- the sure, the hopeless
+
+/// Validates as planned; what exceeds `sure` does not wait, and what falls short of `hopeless` is seen at a glance.
+struct Knowing {
+    plan: Plan,
+    sure: f64,
+    hopeless: f64,
+    looks: Arc<AtomicU32>,
+}
+
+impl Validate for Knowing {
+    fn validate(&self, context: &Context<'_>, _: &Hypothesis) -> Verdict {
+        self.looks.fetch_add(1, Ordering::Relaxed);
+        self.verdict(context)
+    }
+
+    fn glance(&self, context: &Context<'_>, _: &Hypothesis) -> Option<Verdict> {
+        Some(self.verdict(context)).filter(|verdict| verdict.value < self.hopeless)
+    }
+
+    fn is_sure(&self, verdict: &Verdict) -> bool {
+        verdict.value > self.sure
+    }
+}
+
+impl Knowing {
+    fn verdict(&self, context: &Context<'_>) -> Verdict {
+        let (x, quality) = self.plan.get(context.round as usize).copied().unwrap_or((0, 0.0));
+        let free = (x as u32..(x + MODEL) as u32).filter(|&row| !context.claims.contains(row)).count();
+        Verdict { value: quality * free as f64 / MODEL as f64, threshold: THRESHOLD }
+    }
+}
+
+#[test]
+fn a_sure_hypothesis_does_not_wait_for_the_end_of_the_contest() {
+    let plan: Plan = &[(0, 0.5), (20, 0.95), (40, 0.6), (1, 0.7), (60, 0.92), (80, 0.0)];
+    let knowing = Knowing { plan, sure: 0.9, hopeless: 0.0, looks: Arc::default() };
+    let registrar = planned(plan, contest(5)).with_hv(knowing);
+    let mut state = registrar.begin(&Cloud::from(row_of_points(M)), &correspondences()).unwrap();
+    let mut history = Vec::new();
+    while let ControlFlow::Continue(_) = registrar.step(&mut state) {
+        history.push(places(&state));
+    }
+    assert_eq!(history[..4], [vec![], vec![20], vec![20], vec![20]]);
+    // The contest goes on without it, and has its own best first: 1, which takes nine points from 0.
+    assert_eq!(history[4], [20, 60, 1, 40]);
+}
+
+#[test]
+fn what_is_hopeless_at_a_glance_is_not_looked_at() {
+    // Polished in place, so that there is something to glance at. One in three is worth a look.
+    let plan: Plan = &[(0, 0.1), (20, 0.8), (40, 0.1), (60, 0.1), (0, 0.9), (80, 0.1)];
+    let looks = |hopeless: f64| {
+        let looks = Arc::new(AtomicU32::new(0));
+        let knowing = Knowing { plan, sure: 2.0, hopeless, looks: Arc::clone(&looks) };
+        let params = Params { refine: Refine::Icp, max_rounds: Some(6), removal: Removal::Dense, ..base() };
+        let result = register(&planned(plan, params).with_hv(knowing));
+        let verdicts: Vec<_> = result.rounds.iter().map(|round| round.verdict.unwrap().value).collect();
+        assert_eq!(verdicts, plan.iter().map(|&(_, quality)| quality).collect::<Vec<_>>());
+        assert_eq!(sorted_places(&result), [0, 20]);
+        looks.load(Ordering::Relaxed)
+    };
+    assert_eq!((looks(0.0), looks(0.2)), (6, 2));
 }
 
 // ------------------------------------------------------------------- nothing that waits is lost when a run ends

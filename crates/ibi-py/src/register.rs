@@ -36,7 +36,7 @@ impl Source {
         points: PyReadonlyArray2<'_, f64>,
         normals: Option<PyReadonlyArray2<'_, f64>>,
     ) -> PyResult<Self> {
-        let cloud = cloud(&points, normals.as_ref())?;
+        let cloud = with_normals(Cloud::from(rows3(&points, Point3::new)?), normals.as_ref())?;
         let prepared = py.detach(|| PreparedCloud::source(&cloud)).map_err(|e| to_py_err(&e))?;
         Ok(Self(Arc::new(prepared)))
     }
@@ -70,7 +70,9 @@ fn register_clouds<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = params::parse(params)?;
     let source = Arc::clone(&source.0);
-    let mut target = cloud(&tgt, tgt_normals.as_ref())?;
+    // Copied, as other threads may write to the array; borrowed from here on, as scenes can be large.
+    let tgt = rows3(&tgt, Point3::new)?;
+    let mut target = with_normals(Cloud::new(&tgt), tgt_normals.as_ref())?;
     if let Some(viewpoint) = viewpoint {
         target = target.with_viewpoint(Point3::from(viewpoint));
     }
@@ -144,23 +146,19 @@ fn tell(callback: Option<&Py<PyAny>>, round: &Round) -> PyResult<ControlFlow<()>
     })
 }
 
-fn cloud(
-    points: &PyReadonlyArray2<'_, f64>,
-    normals: Option<&PyReadonlyArray2<'_, f64>>,
-) -> PyResult<Cloud<'static>> {
-    let cloud = Cloud::from(rows3(points)?);
+fn with_normals<'a>(cloud: Cloud<'a>, normals: Option<&PyReadonlyArray2<'_, f64>>) -> PyResult<Cloud<'a>> {
     Ok(match normals {
-        Some(normals) => cloud.with_normals(rows3(normals)?.into_iter().map(Vector3::from).collect()),
+        Some(normals) => cloud.with_normals(rows3(normals, Vector3::new)?),
         None => cloud,
     })
 }
 
-fn rows3(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<[f64; 3]>> {
+fn rows3<T>(array: &PyReadonlyArray2<'_, f64>, row: impl Fn(f64, f64, f64) -> T) -> PyResult<Vec<T>> {
     let array = array.as_array();
     if array.ncols() != 3 {
         return Err(InputError::new_err(format!("expected 3 columns, got {}", array.ncols())));
     }
-    Ok(array.rows().into_iter().map(|r| [r[0], r[1], r[2]]).collect())
+    Ok(array.rows().into_iter().map(|r| row(r[0], r[1], r[2])).collect())
 }
 
 /// (M, 2) int64 rows or (M, 6) float64 points.

@@ -10,7 +10,7 @@ use super::simd::simd;
 /// that they vectorise without the compiler having to reassociate, and the bits stay the same.
 pub(crate) const LANES: usize = 16;
 
-/// Point pairs (p_i, q_i), one column per coordinate, each side centred on its mean, in multiples of a unit
+/// Point pairs (p_i, q_i), one column per coordinate, each side centred on its middle, in multiples of a unit
 /// length (the resolution, so that every kernel threshold is the parameter in `_pr` itself).
 ///
 /// Both come before rounding to `f32`: scenes far from the origin (georeferenced scans) or in odd units lose
@@ -31,7 +31,7 @@ impl Columns {
     /// Columns of the pairs `(source[i], target[i])` in multiples of `unit`.
     #[must_use]
     pub fn new(source: &[Point3<f64>], target: &[Point3<f64>], unit: f64) -> Self {
-        let (cp, cq) = (mean(source), mean(target));
+        let (cp, cq) = (middle(source), middle(target));
         Self { p: columns(source, cp, unit), q: columns(target, cq, unit), centres: (cp, cq), unit }
     }
 
@@ -173,10 +173,6 @@ pub(crate) fn middle(points: &[Point3<f64>]) -> Vector3<f64> {
             if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(half, f64::total_cmp).1 }
         })
         .into()
-}
-
-fn mean(points: &[Point3<f64>]) -> Vector3<f64> {
-    points.iter().map(|p| p.coords).sum::<Vector3<f64>>() / points.len().max(1) as f64
 }
 
 pub(crate) fn columns(points: &[Point3<f64>], centre: Vector3<f64>, unit: f64) -> [Vec<f32>; 3] {

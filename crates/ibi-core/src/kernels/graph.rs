@@ -348,9 +348,12 @@ impl Finder<'_> {
         if num <= 2_usize.saturating_mul(self.test.max_degree as usize) {
             return vec![0.0; home.len()];
         }
-        let step = num.div_ceil(SAMPLE);
-        let mut vicinity = Vicinity::new(&self.pairs, runs.iter().cloned().flatten().step_by(step));
-        let scale = num as f32 / num.div_ceil(step) as f32;
+        let step = num as f64 / SAMPLE as f64;
+        let mut chosen = (0..SAMPLE).map(|i| ((i as f64 + out_of_step(i)) * step) as usize).peekable();
+        let all = runs.iter().cloned().flatten().enumerate();
+        let some = all.filter(|&(at, _)| chosen.next_if_eq(&at).is_some()).map(|(_, place)| place);
+        let mut vicinity = Vicinity::new(&self.pairs, some);
+        let scale = step as f32;
         let degrees = home.clone().map(|place| {
             vicinity.join(self.pairs.pair(place), self.test, 0);
             let mut hits = 0_u32;
@@ -520,17 +523,22 @@ fn bits(flags: &[u8; LANES]) -> u64 {
 /// `max_degree`, evenly spread over the places, which are in the order of the grid.
 fn thinned(degrees: &[f32], max_degree: u32) -> Vec<bool> {
     let most = max_degree as f32;
-    let mut credit = 0.5;
+    let mut num_too_many = 0;
     let is_node = degrees.iter().map(|&degree| {
         if degree <= most {
             return true;
         }
-        credit += most / degree;
-        let keep = credit >= 1.0;
-        credit -= f32::from(u8::from(keep));
-        keep
+        num_too_many += 1;
+        out_of_step(num_too_many) < f64::from(most / degree)
     });
     is_node.collect()
+}
+
+/// Evenly spread over 0..1, and in step with no period of the list: the fractional part of i times the golden ratio. A
+/// matcher that gives each point two candidates lists right and wrong ones in turn, and every second of them would all
+/// be wrong.
+fn out_of_step(i: usize) -> f64 {
+    (i as f64 * 0.618_033_988_749_894_9).fract()
 }
 
 impl PairNormals {

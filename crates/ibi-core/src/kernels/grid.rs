@@ -198,7 +198,7 @@ impl Grid {
 }
 
 /// The interval that holds the bulk of the values.
-fn bulk(values: &[f32]) -> (f32, f32) {
+pub(crate) fn bulk(values: &[f32]) -> (f32, f32) {
     let (least, most) =
         values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), &x| (lo.min(x), hi.max(x)));
     if least > most {

@@ -8,7 +8,7 @@ use std::ops::Range;
 use nalgebra::{Point3, Vector3};
 
 use super::columns::{columns, middle};
-use super::grid::Grid;
+use super::grid::{Grid, bulk};
 use super::par;
 use super::rng::Rng;
 use super::simd::simd;
@@ -19,7 +19,7 @@ const LANES: usize = 8;
 /// A cloud, prepared for questions within one reach; ids are the rows of the cloud.
 ///
 /// Distances are compared in `f32`, relative to the middle of the cloud and in multiples of the reach. Of two points
-/// whose distances from the query differ by less than 1e-7 of the query's distance from the middle, either may be
+/// whose distances from the query differ by less than 2.5e-7 of the query's distance from the middle, either may be
 /// taken for the nearest.
 #[derive(Debug)]
 pub struct Nearby {
@@ -124,8 +124,12 @@ pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
     let unit = points.iter().map(|p| (p.coords - middle).amax()).fold(0.0, f64::max).max(f64::MIN_POSITIVE);
     let rows = columns(points, middle, unit);
     // Some points in each cell that has any: where the cloud is a surface, a few dozen.
-    let widest = rows.iter().flatten().fold(0.0, |widest: f32, x| widest.max(x.abs()));
-    let grid = Grid::new(&rows, 2.0 * widest / (n as f32 / POINTS_PER_CELL).cbrt());
+    let widest = rows
+        .each_ref()
+        .map(|axis| bulk(axis))
+        .iter()
+        .fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
+    let grid = Grid::new(&rows, widest / (n as f32 / POINTS_PER_CELL).cbrt());
     let sorted = sorted(&grid, &rows);
     let all: Vec<u32> = (0..n as u32).collect();
     let sample = Rng::new(0, 0, 0).sample(&all, SPACING_SAMPLE);
