@@ -301,12 +301,14 @@ def test_the_unit_does_not_matter(outlier_ratio):
             assert getattr(a, measure) == pytest.approx(getattr(b, measure), rel=1e-6)
 
 
-def test_the_resolution_is_the_mean_spacing_unless_given():
-    def spacing(points):
-        dist_sq = (points**2).sum(1)[:, None] + (points**2).sum(1) - 2 * points @ points.T
-        np.fill_diagonal(dist_sq, np.inf)
-        return np.sqrt(np.maximum(dist_sq.min(axis=1), 0)).mean()
+def spacing(points):
+    """Mean distance to the nearest other point."""
+    dist_sq = (points**2).sum(1)[:, None] + (points**2).sum(1) - 2 * points @ points.T
+    np.fill_diagonal(dist_sq, np.inf)
+    return np.sqrt(np.maximum(dist_sq.min(axis=1), 0)).mean()
 
+
+def test_the_resolution_is_the_mean_spacing_unless_given():
     assert FOUND.resolution == pytest.approx((spacing(SCENE.src) + spacing(SCENE.tgt)) / 2, rel=1e-6)
     assert register(ibi.Params(resolution=0.1)).resolution == 0.1
 
@@ -646,7 +648,7 @@ def test_a_callback_may_register():
     assert [content(found) for found in inner] == [content(FOUND)]
 
 
-# The model that is prepared once -----------------------------------------------------------------------------
+# The model that is prepared once -------------------------------------------------------------------------
 
 
 def test_a_model_finds_what_register_finds_and_again():

@@ -115,8 +115,8 @@ def register(
 class Model:
     """A model (source), checked and prepared once, to be found in any number of scenes.
 
-    Its spacing and diameter are measured once; :func:`register` measures them anew with every call. A model can be
-    pickled, and shared by threads.
+    Its spacing and diameter are measured once; :func:`register` measures them anew with every call. A model
+    can be pickled, and shared by threads.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class Model:
 
     @property
     def diameter(self) -> float:
-        """Largest distance of two points, in data units; measured when first asked for, or by the first run."""
+        """Largest distance of two points, in data units; measured when first asked for."""
         return self._source.diameter
 
     def __len__(self) -> int:

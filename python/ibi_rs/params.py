@@ -66,9 +66,9 @@ class LocalGtm:
     second_order
         Whether an edge is weighed by what its two ends have in common, or by its own rigidity alone.
     max_degree
-        Where correspondences have more compatible ones than this around them, only so many of them take part that
-        they have about as many; at least 8. Bounds time and memory, and keeps those down that are compatible with
-        all and sundry.
+        Where correspondences have more compatible ones than this around them, only so many of them take part
+        that they have about as many; at least 8. Bounds time and memory, and keeps those down that are
+        compatible with all and sundry.
     n_gtm
         N_gtm: generations of the replicator; at least 1.
 
@@ -206,8 +206,8 @@ class Evidence:
     t_score
         The probability to exceed, 0 to 1.
     t_sure
-        A pose that is right with a probability of more than this becomes an instance at once; the others wait for
-        the end of the contest. 0 to 1; 1: all wait.
+        A pose that is right with a probability of more than this becomes an instance at once; the others wait
+        for the end of the contest. 0 to 1; 1: all wait.
     exclusive
         Whether target points that an accepted instance explains support no later one, so that an instance is
         found once.

@@ -70,8 +70,10 @@ pub struct PreparedCloud<'a> {
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
     pub extent: f64,
-    /// Centre of the bounding box; no point is farther from it than half the extent.
+    /// Centre of the bounding box.
     pub centre: Point3<f64>,
+    /// No point is farther from the centre than this; data units.
+    pub radius: f64,
     /// A few points that stand for all, where a mean over the cloud is wanted: [`PROBE_POINTS`] drawn at random.
     probe: Probe,
     /// Fewer still, for a first glance.
@@ -112,12 +114,15 @@ impl<'a> PreparedCloud<'a> {
             return Err(Error::NoExtent { argument });
         }
         let spacing = mean_spacing(points);
+        // A little more, for rounding.
+        let radius = (1.0 + 1e-12) * points.iter().map(|p| (p - centre).norm()).fold(0.0, f64::max);
         Ok(Self {
             points: points.clone(),
             viewpoint: cloud.viewpoint,
             spacing,
             extent,
             centre,
+            radius,
             probe: Probe::new(points, unit_normals.as_deref(), PROBE_POINTS),
             scout: Probe::new(points, unit_normals.as_deref(), SCOUT_POINTS),
             normals: unit_normals,
@@ -306,7 +311,7 @@ impl Scene<'_> {
         let back = target_from_source.inverse();
         let (rotation, shift) = (back.rotation.to_rotation_matrix(), back.translation.vector);
         // Far points need no search.
-        let (centre, radius) = (self.source.centre, 0.5 * self.source.extent + distance);
+        let (centre, radius) = (self.source.centre, self.source.radius + distance);
         let near = points.into_iter().filter_map(|(key, point)| {
             let moved = rotation * point + shift;
             ((moved - centre).norm_squared() <= radius * radius).then_some((key, moved))
@@ -325,7 +330,7 @@ impl Scene<'_> {
     /// The target points within `distance_pr` of the moved source, with the distance of each in data units.
     pub(crate) fn explained(&self, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Vec<(u32, f64)> {
         let centre = target_from_source * self.source.centre;
-        let radius = 0.5 * self.source.extent + distance_pr * self.resolution;
+        let radius = self.source.radius + distance_pr * self.resolution;
         let rows = self.near_target.within(&centre, radius);
         let points = rows.map(|row| (row, self.target.points[row as usize]));
         let near = self.nearest_source(distance_pr, target_from_source, points);

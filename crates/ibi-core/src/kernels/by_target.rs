@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3};
 
 use super::columns::Columns;
 use super::grid::Grid;
@@ -108,15 +108,20 @@ impl ByTarget {
     }
 }
 
-/// A ball around points: the middle of their box, and half of its diagonal.
+/// A ball around points: the middle of their box, and the farthest point from it.
 pub(crate) fn ball(points: &[Vec<f32>; 3]) -> ([f32; 3], f32) {
-    let bounds = points.each_ref().map(|axis| {
-        axis.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), &x| (low.min(x), high.max(x)))
-    });
     if points[0].is_empty() {
         return ([0.0; 3], 0.0);
     }
-    let diagonal = Vector3::from(bounds.map(|(low, high)| high - low));
+    let middle = points.each_ref().map(|axis| {
+        let (low, high) =
+            axis.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), &x| (low.min(x), high.max(x)));
+        0.5 * (low + high)
+    });
+    let dist_sq = (0..points[0].len()).map(|i| {
+        let d = [0, 1, 2].map(|axis| points[axis][i] - middle[axis]);
+        d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    });
     // A little more, for rounding.
-    (bounds.map(|(low, high)| 0.5 * (low + high)), 0.5001 * diagonal.norm())
+    (middle, 1.0001 * dist_sq.fold(0.0, f32::max).sqrt())
 }

@@ -122,7 +122,7 @@ impl Context<'_> {
     /// nearest source point and the distance in data units. At a glance only some: every so many-th of those around.
     fn near(&self, detail: Detail, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Near {
         let scene = self.scene;
-        let radius = 0.5 * scene.source.extent + self.length(distance_pr);
+        let radius = scene.source.radius + self.length(distance_pr);
         let around = self.pairs.by_target.within(&(target_from_source * scene.source.centre), radius);
         let ids: Vec<u32> = around.filter(|&id| self.alive.contains(id)).collect();
         let step = match detail {

@@ -43,6 +43,8 @@ impl Enhance for Voting {
             .filter(|&(id, _)| context.alive.contains(id))
             .unzip();
         let votes = votes(&by_target.sorted().gather(&places), &voters, delta_r);
+        // PAPER: the N_vot best, whatever they have. Those without a vote are taken at random, and removal `dense` would
+        // take them out for nothing.
         let voted = ids.into_iter().zip(votes).filter(|&(_, votes)| votes > 0.0);
         Ranked::best_of(voted.collect(), self.n_vot as usize)
     }
