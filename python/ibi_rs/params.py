@@ -291,8 +291,8 @@ class Params:
         hypothesis validation.
     refine
         How a hypothesis is polished on the clouds: ``"none"``, or ``"icp"``, iterative closest points,
-        point-to-plane where normals count. The polished one stays if its verdict is no worse, and at least
-        ``t_s`` correspondences still agree with it.
+        point-to-plane where normals count. Of an accepted one the better of before and after stays, and at
+        least ``t_s`` correspondences still agree with it.
     n_contest
         A contest lasts this many rounds: at its end the hypotheses that passed validation become instances,
         best value first. 1: each at once, as it is found. At least 1.

@@ -79,8 +79,8 @@ pub enum Refine {
     #[default]
     None,
     /// Iterative closest points within 2 `d_op`: point-to-plane where `min_normal_cos` lets normals count,
-    /// else point-to-point. The polished hypothesis stays if it is validated better than the one before, and if at
-    /// least `t_s` alive correspondences still agree with it.
+    /// else point-to-point. First on few points, for a glance, then on more; of an accepted hypothesis the better one
+    /// of before and after stays. At least `t_s` alive correspondences must still agree.
     Icp,
 }
 

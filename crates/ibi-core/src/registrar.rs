@@ -251,7 +251,9 @@ impl<'a> Registrar<'a> {
         let context = problem.context(&self.params, round);
         let mut timings = Timings::default();
         let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
-        if !self.plays_ahead() || seeds.len() < self.params.t_s as usize {
+        // After a success the next one is likely, and playing ahead would be in vain.
+        let is_lean = state.rounds.last().is_some_and(|last| !last.accepted());
+        if !is_lean || !self.plays_ahead() || seeds.len() < self.params.t_s as usize {
             return self.play_seeds(&context, tried, seeds, timings);
         }
         context.chance(); // not from within the two threads

@@ -181,7 +181,7 @@ impl std::fmt::Display for StopReason {
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[non_exhaustive]
 pub struct Timings {
-    /// Checking the target and the correspondences, kd-tree, resolution.
+    /// Checking the target and the correspondences, grids, resolution.
     pub prepare_s: f64,
     /// Seed correspondence selection, all rounds.
     pub scs_s: f64,

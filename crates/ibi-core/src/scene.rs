@@ -1,4 +1,4 @@
-//! The two clouds and what is known of them: points, normals, viewpoint, kd-trees, resolution.
+//! The two clouds and what is known of them: points, normals, viewpoint, what lies near, resolution.
 
 use std::borrow::Cow;
 use std::sync::OnceLock;
@@ -57,7 +57,7 @@ impl From<Vec<[f64; 3]>> for Cloud<'static> {
     }
 }
 
-/// A cloud that was checked, with its kd-tree and its spacing.
+/// A cloud that was checked, with its spacing.
 #[derive(Debug)]
 pub struct PreparedCloud<'a> {
     /// The points, in data units.

@@ -1,6 +1,6 @@
 //! The nearest point within a reach that is known beforehand: a grid whose cells are twice as wide.
 //!
-//! All questions in the rounds are of this kind. A kd-tree, which answers them at any distance, takes ten times as
+//! All questions in the rounds are of this kind. A kd-tree, which answers them at any distance, takes nine times as
 //! long: it walks down a path of branches that no processor foresees, where eight cells are read straight through.
 
 use std::ops::Range;
