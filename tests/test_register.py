@@ -394,21 +394,24 @@ def described(points, normals):
     return np.hstack([points, 0.1 * normals])
 
 
-@pytest.mark.parametrize("seed", [5, 7])
-def test_the_joint_check_drops_poses_that_live_on_what_others_own(seed):
+def test_the_joint_check_drops_poses_that_live_on_what_others_own():
     """Almost everything is accepted, at once: wrong early poses, which the right ones then take apart."""
-    scene = ibi.synth.ecc_layout(seed, shapes=SHAPES, descriptors=described, descriptor_noise=0.3)
     params = PLAIN.replace(hv=ibi.Evidence(t_score=1e-4), n_contest=1)
-    kept, everything = (
-        ibi.register(scene.src, scene.tgt, scene.corr, params.replace(joint_check=check))
-        for check in (True, False)
-    )
-    matrices = [{pose.target_from_source.tobytes() for pose in found} for found in (kept, everything)]
-    assert matrices[0] < matrices[1]
-    assert kept.rounds == everything.rounds  # it comes after the last round
-    # What it drops is wrong.
-    hits = [metrics.score_scene(found, scene.poses).num_predicted_hit for found in (kept, everything)]
-    assert hits[0] == hits[1]
+    num_dropped = 0
+    for seed in range(24):
+        scene = ibi.synth.ecc_layout(seed, shapes=SHAPES, descriptors=described, descriptor_noise=0.3)
+        kept, everything = (
+            ibi.register(scene.src, scene.tgt, scene.corr, params.replace(joint_check=check))
+            for check in (True, False)
+        )
+        matrices = [{pose.target_from_source.tobytes() for pose in found} for found in (kept, everything)]
+        assert matrices[0] <= matrices[1]
+        num_dropped += len(matrices[1] - matrices[0])
+        assert kept.rounds == everything.rounds  # it comes after the last round
+        # What it drops is wrong.
+        hits = [metrics.score_scene(found, scene.poses).num_predicted_hit for found in (kept, everything)]
+        assert hits[0] == hits[1]
+    assert num_dropped >= 2
 
 
 def test_the_joint_check_leaves_what_does_not_touch():

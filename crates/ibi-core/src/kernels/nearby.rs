@@ -109,7 +109,7 @@ impl Nearby {
 }
 
 /// The mean distance from a point to its nearest other point; 0 for fewer than two points. Points that coincide are 0
-/// apart. Of more than [`SPACING_SAMPLE`] points so many are asked, drawn at random but always the same ones: then the
+/// apart. Of more than 8192 points so many are asked, drawn at random but always the same ones: then the
 /// mean is good to a hundredth.
 ///
 /// # Complexity
