@@ -337,7 +337,7 @@ impl Scene<'_> {
         near.into_iter().map(|(row, _, distance)| (row, distance)).collect()
     }
 
-    /// The pose polished on the two clouds by ICP within 2 `d_op`: on few points for a `first glance`, which brings a
+    /// The pose polished on the two clouds by ICP within 2 `d_op`: on few points for a first glance, which brings a
     /// poor pose most of the way at a quarter of the cost, or on more.
     #[must_use]
     pub fn icp(

@@ -130,31 +130,32 @@ const LANES: usize = 64;
 
 impl Vicinity {
     fn new(pairs: &Columns, places: impl Iterator<Item = usize>) -> Self {
-        let mut places: Vec<u32> = places.map(|place| place as u32).collect();
-        let len = places.len().next_multiple_of(LANES);
-        let coords =
-            [&pairs.p[0], &pairs.p[1], &pairs.p[2], &pairs.q[0], &pairs.q[1], &pairs.q[2]].map(|axis| {
-                let mut column = Vec::with_capacity(len);
-                column.extend(places.iter().map(|&place| axis[place as usize]));
-                // Infinitely far from everything.
-                column.resize(len, f32::INFINITY);
-                column
-            });
-        places.resize(len, NONE);
-        Self { places, coords, is_edge: vec![0; len] }
+        let places = places.map(|place| place as u32).collect();
+        Self::filled(pairs, places, |places, axis, column| {
+            column.extend(places.iter().map(|&place| axis[place as usize]));
+        })
     }
 
     /// The same for whole runs, copied piece by piece.
     fn of_runs(pairs: &Columns, runs: &(impl Iterator<Item = Range<usize>> + Clone)) -> Self {
-        let mut places: Vec<u32> = runs.clone().flat_map(|run| run.start as u32..run.end as u32).collect();
+        let places = runs.clone().flat_map(|run| run.start as u32..run.end as u32).collect();
+        Self::filled(pairs, places, |_, axis, column| {
+            runs.clone().for_each(|run| column.extend_from_slice(&axis[run]));
+        })
+    }
+
+    /// `copy(places, axis, column)` takes the values of the places.
+    fn filled(pairs: &Columns, mut places: Vec<u32>, copy: impl Fn(&[u32], &[f32], &mut Vec<f32>)) -> Self {
         let len = places.len().next_multiple_of(LANES);
-        let coords =
-            [&pairs.p[0], &pairs.p[1], &pairs.p[2], &pairs.q[0], &pairs.q[1], &pairs.q[2]].map(|axis| {
-                let mut column = Vec::with_capacity(len);
-                runs.clone().for_each(|run| column.extend_from_slice(&axis[run]));
-                column.resize(len, f32::INFINITY);
-                column
-            });
+        let [px, py, pz] = &pairs.p;
+        let [qx, qy, qz] = &pairs.q;
+        let coords = [px, py, pz, qx, qy, qz].map(|axis| {
+            let mut column = Vec::with_capacity(len);
+            copy(&places, axis, &mut column);
+            // Infinitely far from everything.
+            column.resize(len, f32::INFINITY);
+            column
+        });
         places.resize(len, NONE);
         Self { places, coords, is_edge: vec![0; len] }
     }
