@@ -210,15 +210,8 @@ pub struct Alive {
 
 impl Alive {
     pub(crate) fn all(pairs: &PointPairs) -> Self {
-        Self::filtered(pairs, |_| true)
-    }
-
-    /// Those of `pairs` that `keep` keeps.
-    pub(crate) fn filtered(pairs: &PointPairs, keep: impl Fn(u32) -> bool) -> Self {
-        let flags: Vec<bool> = (0..pairs.len() as u32).map(keep).collect();
-        let len = flags.iter().filter(|&&alive| alive).count();
-        let all = Arc::clone(&pairs.columns);
-        Self { flags, len, all, ids: OnceLock::new(), columns: OnceLock::new() }
+        let (flags, len) = (vec![true; pairs.len()], pairs.len());
+        Self { flags, len, all: Arc::clone(&pairs.columns), ids: OnceLock::new(), columns: OnceLock::new() }
     }
 
     /// How many there are.

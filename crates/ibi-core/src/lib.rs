@@ -20,6 +20,7 @@
 //! With the feature `rayon` (default) kernels run on a thread pool of the registrar's own; `serde` makes
 //! parameters and results plain data.
 
+mod claims;
 mod correspondence;
 mod error;
 mod interrupt;
@@ -33,6 +34,7 @@ mod scene;
 pub mod stages;
 mod state;
 
+pub use claims::{Claims, NearClaims};
 pub use correspondence::{Alive, Correspondences, PointPairs};
 pub use error::{Argument, Error};
 pub use interrupt::{CancelToken, Interrupt};
@@ -40,5 +42,5 @@ pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};
 pub use registration::{Pose, Registration, Round, StopReason, Timings};
-pub use scene::{Claims, Cloud, Detail, PreparedCloud, Scene};
+pub use scene::{Cloud, Detail, PreparedCloud, Scene};
 pub use state::State;

@@ -247,8 +247,9 @@ impl<'a> Registrar<'a> {
     /// What the stages make of the next round. Where a second thread is idle it plays the round after it at the same
     /// time, as it will be if this one comes to nothing: most do, and else it is played again.
     fn play(&self, state: &mut State<'_>) -> Play {
-        let (problem, tried, round) = (&state.problem, &state.tried, state.rounds.len());
-        let context = problem.context(&self.params, round);
+        let State { problem, tried, found, .. } = &*state;
+        let round = state.rounds.len();
+        let context = problem.context(&self.params, round, found);
         let mut timings = Timings::default();
         let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
         // After a success the next one is likely, and playing ahead would be in vain.
@@ -261,7 +262,7 @@ impl<'a> Registrar<'a> {
         let (now, next) = par::join(
             || self.play_seeds(&context, tried, seeds, timings),
             || {
-                let context = Context { barred: &barred, ..problem.context(&self.params, round + 1) };
+                let context = Context { barred: &barred, ..problem.context(&self.params, round + 1, found) };
                 let mut timings = Timings::default();
                 let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
                 self.play_seeds(&context, tried, seeds, timings)

@@ -181,36 +181,6 @@ impl Probe {
     }
 }
 
-/// Which scene points accepted instances explain.
-#[derive(Debug, Clone, Copy)]
-pub struct Claims<'a> {
-    /// For each row of the target the instance that explains it, or [`Self::NOBODY`].
-    owners: &'a [u32],
-    /// An instance whose claims do not count.
-    except: u32,
-}
-
-impl<'a> Claims<'a> {
-    /// The owner of a point that no instance explains.
-    pub(crate) const NOBODY: u32 = u32::MAX;
-
-    pub(crate) fn new(owners: &'a [u32]) -> Self {
-        Self { owners, except: Self::NOBODY }
-    }
-
-    /// All claims but those of one instance.
-    pub(crate) fn of_others(owners: &'a [u32], instance: u32) -> Self {
-        Self { owners, except: instance }
-    }
-
-    /// Whether an accepted instance explains a row of the target.
-    #[must_use]
-    pub fn contains(&self, row: u32) -> bool {
-        let owner = self.owners[row as usize];
-        owner != Self::NOBODY && owner != self.except
-    }
-}
-
 /// How many source points are looked at.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Detail {
@@ -317,7 +287,7 @@ impl Scene<'_> {
             ((moved - centre).norm_squared() <= radius * radius).then_some((key, moved))
         });
         let mut found = Vec::new();
-        self.near_source.nearest_each(near, |key, moved, row| {
+        self.near_source.nearest_each(distance, near, |key, moved, row| {
             let Some(row) = row else { return };
             let gap = (moved - self.source.points[row as usize]).norm();
             if gap <= distance {
@@ -325,16 +295,6 @@ impl Scene<'_> {
             }
         });
         found
-    }
-
-    /// The target points within `distance_pr` of the moved source, with the distance of each in data units.
-    pub(crate) fn explained(&self, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Vec<(u32, f64)> {
-        let centre = target_from_source * self.source.centre;
-        let radius = self.source.radius + distance_pr * self.resolution;
-        let rows = self.near_target.within(&centre, radius);
-        let points = rows.map(|row| (row, self.target.points[row as usize]));
-        let near = self.nearest_source(distance_pr, target_from_source, points);
-        near.into_iter().map(|(row, _, distance)| (row, distance)).collect()
     }
 
     /// The pose polished on the two clouds by ICP within 2 `d_op`: on few points for a first glance, which brings a

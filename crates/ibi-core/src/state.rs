@@ -6,16 +6,17 @@ use std::time::Instant;
 
 use nalgebra::Isometry3;
 
+use crate::claims::Claims;
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
-use crate::joint::Shares;
+use crate::joint::alone;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::overlap::overlap;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
-use crate::scene::{Claims, Detail, Scene};
+use crate::scene::{Detail, Scene};
 use crate::stages::{Chance, Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
 
 /// Fewest correspondences that fix a pose.
@@ -46,8 +47,6 @@ pub(crate) struct Problem<'a> {
     pub(crate) pairs: PointPairs,
     pub(crate) alive: Alive,
     pub(crate) barred: Vec<bool>,
-    /// For each row of the target the instance that explains it.
-    pub(crate) owners: Vec<u32>,
     pub(crate) graph: OnceLock<Graph>,
     pub(crate) chance: OnceLock<Chance>,
     pub(crate) interrupt: Interrupt,
@@ -96,8 +95,6 @@ impl Tried {
 pub(crate) struct Found {
     pub(crate) hypothesis: Hypothesis,
     pub(crate) round: u32,
-    /// The target rows it explains, with the distance of each.
-    pub(crate) explained: Vec<(u32, f64)>,
 }
 
 impl Found {
@@ -109,17 +106,7 @@ impl Found {
 impl<'a> Problem<'a> {
     pub(crate) fn new(scene: Scene<'a>, pairs: PointPairs, interrupt: Interrupt) -> Self {
         let (alive, barred) = (Alive::all(&pairs), vec![false; pairs.len()]);
-        let owners = vec![Claims::NOBODY; scene.target.points.len()];
-        Self {
-            scene,
-            pairs,
-            alive,
-            barred,
-            owners,
-            graph: OnceLock::new(),
-            chance: OnceLock::new(),
-            interrupt,
-        }
+        Self { scene, pairs, alive, barred, graph: OnceLock::new(), chance: OnceLock::new(), interrupt }
     }
 
     /// Whether two poses of the source can have to do with the same target points.
@@ -137,20 +124,6 @@ impl<'a> Problem<'a> {
         self.alive.remove(ids) as u32
     }
 
-    /// Claims the target points within `d_op` of an accepted instance; returns their rows, with the distance of each.
-    fn claim(
-        &mut self,
-        params: &Params,
-        instance: u32,
-        target_from_source: &Isometry3<f64>,
-    ) -> Vec<(u32, f64)> {
-        let explained = self.scene.explained(params.d_op_pr, target_from_source);
-        for &(row, _) in &explained {
-            self.owners[row as usize] = instance;
-        }
-        explained
-    }
-
     /// What is barred from leading once `ids` are too.
     pub(crate) fn also_barred(&self, ids: &[u32]) -> Vec<bool> {
         let mut barred = self.barred.clone();
@@ -165,17 +138,17 @@ impl<'a> Problem<'a> {
         ids.iter().map(|&id| u32::from(!std::mem::replace(&mut self.barred[id as usize], true))).sum()
     }
 
-    pub(crate) fn context<'c>(&'c self, params: &'c Params, round: usize) -> Context<'c> {
-        self.context_of(params, round, &self.alive, Claims::new(&self.owners))
+    pub(crate) fn context<'c>(&'c self, params: &'c Params, round: usize, found: &'c [Found]) -> Context<'c> {
+        self.context_of(params, round, &self.alive, found)
     }
 
-    /// A context with other correspondences alive and other scene points claimed.
+    /// A context with other correspondences alive.
     pub(crate) fn context_of<'c>(
         &'c self,
         params: &'c Params,
         round: usize,
         alive: &'c Alive,
-        claims: Claims<'c>,
+        found: &'c [Found],
     ) -> Context<'c> {
         Context {
             scene: &self.scene,
@@ -184,7 +157,7 @@ impl<'a> Problem<'a> {
             params,
             round: round as u32,
             barred: &self.barred,
-            claims,
+            claims: Claims::new(&self.scene, params, found),
             graph: &self.graph,
             chance: &self.chance,
             interrupt: &self.interrupt,
@@ -271,7 +244,7 @@ impl<'a> State<'a> {
             (Removal::Inliers, None) => (&[][..], seeds.ids().to_vec()),
             // The seeds too: they may all lie outside of the pose that they led to.
             (Removal::Inliers, Some(hypothesis)) => {
-                let context = self.problem.context(params, index as usize);
+                let context = self.problem.context(params, index as usize, &self.found);
                 let inliers = context.inliers(&hypothesis.target_from_source, 2.0 * params.t_he_pr);
                 (&[][..], [seeds.ids(), &inliers].concat())
             }
@@ -332,7 +305,7 @@ impl<'a> State<'a> {
             let since = &self.found[candidate.measured_at as usize..];
             let pose = &candidate.hypothesis.target_from_source;
             if since.iter().any(|found| self.problem.are_near(params, pose, found.pose())) {
-                let context = self.problem.context(params, candidate.round as usize);
+                let context = self.problem.context(params, candidate.round as usize, &self.found);
                 let verdict = hv.validate(&context, &candidate.hypothesis);
                 (candidate.value, candidate.measured_at) = (verdict.value, now);
                 return verdict.accepted();
@@ -353,32 +326,29 @@ impl<'a> State<'a> {
         let Candidate { hypothesis, value, round, .. } = self.candidates.remove(at);
         let target_from_source = hypothesis.target_from_source;
         if params.removal == Removal::Inliers {
-            let spent = self.problem.context(params, round as usize).spent(&target_from_source);
+            let spent = self.problem.context(params, round as usize, &self.found).spent(&target_from_source);
             let num_removed = self.problem.remove(&spent);
             if let Some(last) = self.rounds.last_mut() {
                 last.num_removed += num_removed;
             }
         }
-        let explained = self.problem.claim(params, self.num_found(), &target_from_source);
         (self.tried, self.ahead) = (Tried::default(), None);
-        self.found.push(Found { hypothesis, round, explained });
+        self.found.push(Found { hypothesis, round });
         self.last_passed_at = self.rounds.len() as u32;
         Some(value)
     }
 
     /// The result: poses measured and ranked, correspondences labelled.
     pub(crate) fn into_registration(mut self, params: &Params, stop_reason: StopReason) -> Registration {
-        let shares = params.joint_check.then(|| Shares::new(&self.problem, &self.found));
         let everything = Alive::all(&self.problem.pairs);
-        self.problem.context(params, 0).chance();
+        let of_all = self.problem.context_of(params, 0, &everything, &self.found);
+        of_all.chance(); // not from within the map
         let mut measured: Vec<(Pose, Vec<f64>)> = par::map(self.found.len(), 1, |at| {
             let found = &self.found[at];
-            let support = if let Some(shares) = &shares {
-                shares.alone(&self.problem, params, at, |own| own.support(Detail::Look, found.pose(), true))
+            let support = if params.joint_check {
+                alone(&of_all, at, found, |own| own.support(Detail::Look, found.pose(), true))
             } else {
-                let claims = Claims::new(&self.problem.owners);
-                let all = self.problem.context_of(params, 0, &everything, claims);
-                all.support(Detail::Look, found.pose(), false)
+                of_all.support(Detail::Look, found.pose(), false)
             };
             measure(&self.problem, params, found, &support)
         });

@@ -74,7 +74,9 @@ fn check_nearby(cloud: &[Point3<f64>], reach: f64, queries: &[Point3<f64>]) {
     }
     // Queries come back with their keys, each once and in order.
     let mut told = Vec::new();
-    nearby.nearest_each(queries.iter().copied().enumerate(), |key, query, row| told.push((key, *query, row)));
+    nearby.nearest_each(nearby.reach(), queries.iter().copied().enumerate(), |key, query, row| {
+        told.push((key, *query, row));
+    });
     let asked = queries.iter().zip(&rows).enumerate();
     assert!(told.into_iter().eq(asked.map(|(key, (query, row))| (key, *query, *row))));
 }
@@ -176,7 +178,7 @@ fn few_points() {
     let empty = Nearby::new(&[], 1.0);
     assert_eq!((empty.nearest(&here), empty.nearest(&Point3::origin())), (None, None));
     assert_eq!(empty.within(&Point3::origin(), 1e9).count(), 0);
-    empty.nearest_each([(7, here)], |key, _, row| assert_eq!((key, row), (7, None)));
+    empty.nearest_each(1.0, [(7, here)], |key, _, row| assert_eq!((key, row), (7, None)));
     for reach in [1e-6, 0.499, 0.501, 1e9] {
         let one = Nearby::new(&[here], reach);
         assert_eq!(one.nearest(&here), Some(0));

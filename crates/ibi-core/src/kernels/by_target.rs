@@ -62,7 +62,7 @@ impl ByTarget {
 
     /// Ids of the pairs whose target point lies within `radius` of `place`, both in the unit and frame of the target
     /// points as they were given.
-    pub fn within(&self, place: &Point3<f64>, radius: f64) -> impl Iterator<Item = u32> + '_ {
+    pub fn within(&self, place: &Point3<f64>, radius: f64) -> impl Iterator<Item = u32> + use<'_> {
         let Columns { centres: (_, centre_q), unit, .. } = self.sorted;
         let place: [f32; 3] = ((place.coords - centre_q) / unit).cast().into();
         // A little more, for rounding.

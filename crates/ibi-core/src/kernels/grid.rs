@@ -6,7 +6,8 @@ use std::ops::Range;
 #[derive(Debug)]
 pub struct Grid {
     low: [f32; 3],
-    inv_cell: f32,
+    /// 1 / width of a cell, per axis.
+    inv_cell: [f32; 3],
     /// Cells per axis.
     shape: [usize; 3],
     /// Start of each cell in `order`, plus the end.
@@ -14,7 +15,8 @@ pub struct Grid {
     order: Vec<u32>,
 }
 
-/// Cells at most: as many as four times the points, or this many. Beyond it cells grow.
+/// Cells at most: as many as four times the points, or this many. Beyond it cells grow: first along z, where the points of
+/// a column stand together anyhow and a few more cost nothing, then on all axes.
 const MIN_CELLS: usize = 1 << 12;
 const CELLS_PER_POINT: usize = 4;
 
@@ -25,7 +27,7 @@ const MARGIN: f32 = 0.25;
 const SAMPLE: usize = 1000;
 
 impl Grid {
-    /// Sorts `points` into cells of at least `cell`.
+    /// Sorts `points` into cells of at least `cell`; where there would be too many, longer ones.
     ///
     /// The cells cover the box that holds nearly all of a sample of the points. What lies outside counts to the cells
     /// on the rim, so that one stray point a kilometre away does not make all others share a cell.
@@ -39,18 +41,18 @@ impl Grid {
         let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
         let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
         let mut cell = cell.max(widest / max_cells as f32).max(f32::MIN_POSITIVE);
-        let shape_of = |cell: f32| bounds.map(|(low, high)| ((high - low) / cell) as usize + 1);
-        while shape_of(cell)
-            .iter()
-            .try_fold(1_usize, |all, &n| all.checked_mul(n))
-            .is_none_or(|c| c > max_cells)
-        {
-            cell *= 1.2;
+        let num = |axis: usize, cell: f32| ((bounds[axis].1 - bounds[axis].0) / cell) as usize + 1;
+        while num(0, cell).checked_mul(num(1, cell)).is_none_or(|columns| columns > max_cells) {
+            cell *= 1.1;
         }
+        let shape = [num(0, cell), num(1, cell)];
+        let height = max_cells / (shape[0] * shape[1]);
+        // A little more, for rounding.
+        let cell_z = cell.max((bounds[2].1 - bounds[2].0) / height as f32 * 1.0001);
         let mut grid = Self {
             low: bounds.map(|(low, _)| low),
-            inv_cell: 1.0 / cell,
-            shape: shape_of(cell),
+            inv_cell: [cell, cell, cell_z].map(|cell| 1.0 / cell),
+            shape: [shape[0], shape[1], num(2, cell_z).min(height)],
             starts: Vec::new(),
             order: Vec::new(),
         };
@@ -79,10 +81,10 @@ impl Grid {
         &self.order
     }
 
-    /// Width of a cell.
+    /// Width of a cell on the axis where it is least.
     #[must_use]
     pub fn cell_size(&self) -> f32 {
-        1.0 / self.inv_cell
+        1.0 / self.inv_cell[0]
     }
 
     /// Ranges of [`Self::order`], ascending, that hold every point within `radius` of `place`, and others.
@@ -112,8 +114,8 @@ impl Grid {
     pub fn neighborhoods(&self, radius: f32) -> impl Iterator<Item = (Range<usize>, Vec<Range<usize>>)> + '_ {
         let [nx, ny, nz] = self.shape;
         let cells = (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])));
-        // In cells; a little more, for rounding.
-        let radius = radius * 1.001 * self.inv_cell;
+        // A little more, for rounding.
+        let radius = radius * 1.001;
         cells.filter_map(move |cell| {
             let index = self.index(cell);
             let home = self.starts[index] as usize..self.starts[index + 1] as usize;
@@ -121,20 +123,21 @@ impl Grid {
         })
     }
 
-    /// As [`Self::neighborhoods`] for one cell; the radius in cells.
+    /// As [`Self::neighborhoods`] for one cell.
     fn around_cell(&self, [x, y, z]: [usize; 3], radius: f32) -> Vec<Range<usize>> {
-        let most = radius.ceil() as usize;
+        let [wide, _, high] = self.inv_cell.map(|inv_cell| radius * inv_cell); // in cells
+        let most = wide.ceil() as usize;
         let window = |c: usize, axis: usize| c.saturating_sub(most)..=(c + most).min(self.shape[axis] - 1);
         // Between two cells lie all those that separate them.
         let gap = |a: usize, b: usize| a.abs_diff(b).saturating_sub(1) as f32;
         let mut runs = Vec::new();
         for other_x in window(x, 0) {
             for other_y in window(y, 1) {
-                let left = radius * radius - gap(x, other_x).powi(2) - gap(y, other_y).powi(2);
+                let left = wide * wide - gap(x, other_x).powi(2) - gap(y, other_y).powi(2);
                 if left < 0.0 {
                     continue;
                 }
-                let reach = left.sqrt() as usize + 1;
+                let reach = (left.sqrt() / wide * high) as usize + 1;
                 let row = self.index([other_x, other_y, 0]);
                 let (first, last) = (z.saturating_sub(reach), (z + reach).min(self.shape[2] - 1));
                 let run = self.starts[row + first] as usize..self.starts[row + last + 1] as usize;
@@ -152,7 +155,7 @@ impl Grid {
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn block(&self, place: [f32; 3]) -> [Range<usize>; 4] {
         let [x, y, z] = [0, 1, 2].map(|axis| {
-            let at = (place[axis] - self.low[axis]) * self.inv_cell - 0.5;
+            let at = (place[axis] - self.low[axis]) * self.inv_cell[axis] - 0.5;
             let last = self.shape[axis] - 1;
             // A cast of a negative number gives 0; below half a cell there is none before the first.
             [(at as usize).min(last), ((at + 1.0) as usize).min(last)]
@@ -172,13 +175,32 @@ impl Grid {
         ]
     }
 
+    /// Ranges of [`Self::order`] that hold every point within a cell (a little less) of `place`: of each axis three
+    /// neighbouring cells.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // the head of an inner loop
+    pub(crate) fn wide_block(&self, place: [f32; 3]) -> [Range<usize>; 9] {
+        let [x, y, z] = self.cell(place);
+        let end = self.shape[2];
+        std::array::from_fn(|i| {
+            // Beyond the rim there is no cell: an offset of -1 wraps around.
+            let (x, y) = ((x + i / 3).wrapping_sub(1), (y + i % 3).wrapping_sub(1));
+            if x >= self.shape[0] || y >= self.shape[1] {
+                return 0..0;
+            }
+            let row = self.index([x, y, 0]);
+            let (first, last) = (z.saturating_sub(1), (z + 2).min(end));
+            self.starts[row + first] as usize..self.starts[row + last] as usize
+        })
+    }
+
     /// How far `x` is from the cells `c` of an axis: 0 within, and beyond the rim, whose cells have no end.
     fn gap(&self, axis: usize, c: usize, x: f32) -> f32 {
-        let at = (x - self.low[axis]) * self.inv_cell;
+        let at = (x - self.low[axis]) * self.inv_cell[axis];
         let below = if c > 0 { c as f32 - at } else { 0.0 };
         let above = if c + 1 < self.shape[axis] { at - (c + 1) as f32 } else { 0.0 };
         // Rounding of the cell of a point and of this gap may differ.
-        (below.max(above) - 1e-3).max(0.0) / self.inv_cell
+        (below.max(above) - 1e-3).max(0.0) / self.inv_cell[axis]
     }
 
     fn cell(&self, p: [f32; 3]) -> [usize; 3] {
@@ -188,7 +210,7 @@ impl Grid {
     #[inline]
     fn along(&self, axis: usize, x: f32) -> usize {
         // A cast of a negative number gives 0.
-        (((x - self.low[axis]) * self.inv_cell) as usize).min(self.shape[axis] - 1)
+        (((x - self.low[axis]) * self.inv_cell[axis]) as usize).min(self.shape[axis] - 1)
     }
 
     #[inline]

@@ -1,6 +1,6 @@
-//! The nearest point within a reach that is known beforehand: a grid whose cells are twice as wide.
+//! The nearest point within a reach that is known beforehand: a grid whose cells are as wide.
 //!
-//! All questions in the rounds are of this kind. A kd-tree, which answers them at any distance, takes nine times as
+//! All questions in the rounds are of this kind. A kd-tree, which answers them at any distance, takes many times as
 //! long: it walks down a path of branches that no processor foresees, where eight cells are read straight through.
 
 use std::ops::Range;
@@ -11,10 +11,10 @@ use super::columns::{columns, middle};
 use super::grid::{Grid, bulk};
 use super::par;
 use super::rng::Rng;
-use super::simd::simd;
+use super::simd::{Simd, WithSimd, bytemuck, dispatch};
 
-/// How many points are looked at side by side.
-const LANES: usize = 8;
+/// How many points are looked at side by side, at most.
+const LANES: usize = 16;
 
 /// A cloud, prepared for questions within one reach; ids are the rows of the cloud.
 ///
@@ -23,9 +23,7 @@ const LANES: usize = 8;
 /// taken for the nearest.
 #[derive(Debug)]
 pub struct Nearby {
-    grid: Grid,
-    /// Coordinates in the order of the grid, with `LANES` points at infinity at the end.
-    points: [Vec<f32>; 3],
+    sorted: Sorted,
     middle: Vector3<f64>,
     reach: f64,
     inv_reach: f64,
@@ -43,10 +41,8 @@ impl Nearby {
     pub fn new(points: &[Point3<f64>], reach: f64) -> Self {
         let middle = middle(points);
         let rows = columns(points, middle, reach);
-        // The reach is 1. Two cells on each axis hold it, whichever side of its cell the query lies on.
-        let grid = Grid::new(&rows, 2.001);
-        let points = sorted(&grid, &rows);
-        Self { grid, points, middle, reach, inv_reach: 1.0 / reach }
+        // The reach is 1: a cell and its neighbours hold it.
+        Self { sorted: Sorted::new(&rows, 1.001), middle, reach, inv_reach: 1.0 / reach }
     }
 
     /// The reach, in the unit of the points.
@@ -58,25 +54,28 @@ impl Nearby {
     /// The row of the point nearest to `query`, if one lies within the reach.
     #[must_use]
     pub fn nearest(&self, query: &Point3<f64>) -> Option<u32> {
+        self.nearest_within(query, self.reach)
+    }
+
+    /// The row of the point nearest to `query`, if one lies within `distance`, which is at most the reach.
+    #[must_use]
+    pub fn nearest_within(&self, query: &Point3<f64>, distance: f64) -> Option<u32> {
         let mut nearest = None;
-        self.nearest_each([((), *query)], |(), _, row| nearest = row);
+        self.nearest_each(distance, [((), *query)], |(), _, row| nearest = row);
         nearest
     }
 
-    /// Tells `found(key, query, row)` of each `(key, query)` the row of the nearest point, if one lies within the reach.
+    /// Tells `found(key, query, row)` of each `(key, query)` the row of the nearest point, if one lies within
+    /// `distance`, up to rounding; it is at most the reach. Within half the reach it is found in half the time.
     pub fn nearest_each<K>(
         &self,
+        distance: f64,
         queries: impl IntoIterator<Item = (K, Point3<f64>)>,
-        mut found: impl FnMut(K, &Point3<f64>, Option<u32>),
+        found: impl FnMut(K, &Point3<f64>, Option<u32>),
     ) {
-        simd(
-            #[inline(always)]
-            || {
-                for (key, query) in queries {
-                    found(key, &query, self.row(&query));
-                }
-            },
-        );
+        // A little more, for rounding.
+        let bound = (distance * self.inv_reach * (1.0 + 1e-6)) as f32;
+        dispatch(NearestEach { nearby: self, bound, queries: queries.into_iter(), found });
     }
 
     /// Rows of the points within `distance` of `query`, up to rounding, in no particular order. The distance may exceed
@@ -85,10 +84,11 @@ impl Nearby {
         let q = self.local(query);
         // A little more, for rounding.
         let radius = (distance / self.reach * (1.0 + 1e-6)) as f32;
-        let [x, y, z] = self.points.each_ref().map(Vec::as_slice);
-        self.grid.around(q, radius).flatten().filter_map(move |at| {
+        let Sorted { grid, points, .. } = &self.sorted;
+        let [x, y, z] = points.each_ref().map(Vec::as_slice);
+        grid.around(q, radius).flatten().filter_map(move |at| {
             let d = [x[at] - q[0], y[at] - q[1], z[at] - q[2]];
-            (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius * radius).then(|| self.grid.order()[at])
+            (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius * radius).then(|| grid.order()[at])
         })
     }
 
@@ -98,13 +98,47 @@ impl Nearby {
 
     #[inline(always)]
     #[allow(clippy::inline_always)] // the body of the loop above
-    fn row(&self, query: &Point3<f64>) -> Option<u32> {
+    fn row<S: Simd>(&self, simd: S, query: &Point3<f64>, bound: f32) -> Option<u32> {
         let q = self.local(query);
-        let mut best = Best::within(1.000_001);
-        for run in self.grid.block(q) {
-            best.look::<false>(&self.points, run, q, NONE);
+        let grid = &self.sorted.grid;
+        let mut search = Search::new(simd, &self.sorted, q, bound * bound);
+        for run in grid.block(q) {
+            search.look::<false>(run, NONE);
         }
-        best.first().map(|(at, _)| self.grid.order()[at])
+        // Most points of a pose that is right end here: they have a neighbour within half a cell.
+        let seen = SEEN * grid.cell_size();
+        let row = search.row_within(seen); // all that is searched for lies within `bound`
+        if bound <= seen || row.is_some() {
+            return row;
+        }
+        for run in grid.wide_block(q) {
+            search.look::<false>(run, NONE);
+        }
+        search.row_within(f32::INFINITY)
+    }
+}
+
+/// The loop of [`Nearby::nearest_each`].
+struct NearestEach<'a, I, F> {
+    nearby: &'a Nearby,
+    bound: f32,
+    queries: I,
+    found: F,
+}
+
+impl<K, I, F> WithSimd for NearestEach<'_, I, F>
+where
+    I: Iterator<Item = (K, Point3<f64>)>,
+    F: FnMut(K, &Point3<f64>, Option<u32>),
+{
+    type Output = ();
+
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
+    fn with_simd<S: Simd>(mut self, simd: S) {
+        for (key, query) in self.queries {
+            (self.found)(key, &query, self.nearby.row(simd, &query, self.bound));
+        }
     }
 }
 
@@ -123,111 +157,213 @@ pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
     let middle = middle(points);
     let unit = points.iter().map(|p| (p.coords - middle).amax()).fold(0.0, f64::max).max(f64::MIN_POSITIVE);
     let rows = columns(points, middle, unit);
-    // Some points in each cell that has any: where the cloud is a surface, a few dozen.
+    // About as many cells as points fill a volume. Most clouds are surfaces: then cells are crowded, and a few
+    // questions tell how much finer they should be.
     let widest = rows
         .each_ref()
         .map(|axis| bulk(axis))
         .iter()
         .fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
-    let grid = Grid::new(&rows, widest / (n as f32 / POINTS_PER_CELL).cbrt());
-    let sorted = sorted(&grid, &rows);
-    let all: Vec<u32> = (0..n as u32).collect();
-    let sample = Rng::new(0, 0, 0).sample(&all, SPACING_SAMPLE);
-    // What lies in the cells around is seen in one look, as in `Nearby`; only what is farther off is searched for.
-    let seen = 0.499 * grid.cell_size();
-    let totals = par::chunks(sample.len(), SPACING_GRAIN, |run| {
-        let mut total = 0.0;
-        simd(
-            #[inline(always)]
-            || {
-                for &at in &sample[run] {
-                    let q = sorted.each_ref().map(|axis| axis[at as usize]);
-                    let mut best = Best::within(f32::INFINITY);
-                    for run in grid.block(q) {
-                        best.look::<true>(&sorted, run, q, at);
-                    }
-                    let mut radius = seen;
-                    let other = loop {
-                        match best.first() {
-                            // Nothing is farther off than twice the middle from the rim, on three axes.
-                            Some((other, dist_sq)) if dist_sq <= radius * radius || radius > 4.0 => {
-                                break other;
-                            }
-                            _ => radius *= 2.0,
-                        }
-                        for run in grid.around(q, radius) {
-                            best.look::<true>(&sorted, run, q, at);
-                        }
-                    };
-                    let [here, there] = [at as usize, other].map(|at| points[grid.order()[at] as usize]);
-                    total += (here - there).norm();
-                }
-            },
-        );
-        total
-    });
-    totals.iter().sum::<f64>() / sample.len() as f64
+    let coarse = Sorted::new(&rows, widest / (n as f32 / POINTS_PER_CELL).cbrt());
+    let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE));
+    guess.sort_unstable_by(f64::total_cmp);
+    // The median: a few far points must not make the cells of all others wide.
+    let cell = CELL_PER_SPACING * (guess[guess.len() / 2] / unit) as f32;
+    let spacings = if cell < 0.7 * coarse.grid.cell_size() {
+        let fine = Sorted::new(&rows, cell);
+        fine.spacings(Some(&coarse), points, &fine.strata(SPACING_SAMPLE))
+    } else {
+        coarse.spacings(None, points, &coarse.strata(SPACING_SAMPLE))
+    };
+    spacings.iter().sum::<f64>() / spacings.len() as f64
 }
 
-/// About how many points a cell would hold if they filled a volume.
+/// About how many points a cell of the first grid would hold if they filled a volume.
 const POINTS_PER_CELL: f32 = 2.0;
 
-/// How many points stand for a cloud when its spacing is measured.
+/// How wide a cell of the second grid is: most points have their nearest within half of it.
+const CELL_PER_SPACING: f32 = 3.0;
+
+/// How many points stand for a cloud when its spacing is measured, and when it is guessed.
 const SPACING_SAMPLE: usize = 8192;
+const GUESS_SAMPLE: usize = 64;
 
 /// Points that one thread asks at a time.
 const SPACING_GRAIN: usize = 1024;
 
-/// Columns in the order of the grid, with `LANES` values at infinity at the end.
-fn sorted(grid: &Grid, rows: &[Vec<f32>; 3]) -> [Vec<f32>; 3] {
-    rows.each_ref().map(|axis| {
-        let sorted = grid.order().iter().map(|&i| axis[i as usize]);
-        sorted.chain([f32::INFINITY; LANES]).collect()
-    })
+/// Columns in the order of a grid over them, with `LANES` points at infinity at the end.
+#[derive(Debug)]
+struct Sorted {
+    grid: Grid,
+    points: [Vec<f32>; 3],
+    /// The row of each.
+    rows: Vec<u32>,
 }
 
-/// The nearest point so far, lane by lane.
-struct Best {
-    dist_sq: [f32; LANES],
-    at: [u32; LANES],
-}
-
-impl Best {
-    #[inline(always)]
-    #[allow(clippy::inline_always)]
-    fn within(dist_sq: f32) -> Self {
-        Self { dist_sq: [dist_sq; LANES], at: [NONE; LANES] }
+impl Sorted {
+    fn new(rows: &[Vec<f32>; 3], cell: f32) -> Self {
+        let grid = Grid::new(rows, cell);
+        let points = rows.each_ref().map(|axis| {
+            let sorted = grid.order().iter().map(|&i| axis[i as usize]);
+            sorted.chain([f32::INFINITY; LANES]).collect()
+        });
+        let rows = grid.order().iter().copied().chain([NONE; LANES]).collect();
+        Self { grid, points, rows }
     }
 
-    /// Looks at the points of `run`, and at a few beyond its end: other points of the cloud, which do no harm. With
-    /// `SKIP` not at `skip`.
+    /// One position of each of `count` equal stretches of the order, drawn at random; all if there are no more.
+    fn strata(&self, count: usize) -> Vec<u32> {
+        let n = self.grid.order().len();
+        if n <= count {
+            return (0..n as u32).collect();
+        }
+        let mut rng = Rng::new(0, 0, 0);
+        let start = |stratum: usize| stratum * n / count;
+        (0..count).map(|i| (start(i) + rng.below(start(i + 1) - start(i))) as u32).collect()
+    }
+
+    /// The distance, in the unit of `rows`, of each of the points at `positions` of the order to its nearest other point.
+    /// `rows` are the points that the columns were made from, as they were given. A point whose cells hold no other is
+    /// looked up in the `coarser` columns, if there are any.
+    fn spacings(&self, coarser: Option<&Self>, rows: &[Point3<f64>], positions: &[u32]) -> Vec<f64> {
+        let chunks = par::chunks(positions.len(), SPACING_GRAIN, |run| {
+            dispatch(Spacings { sorted: self, coarser, rows, positions: &positions[run] })
+        });
+        chunks.concat()
+    }
+
+    /// The row of the point nearest to that at `place`, which is itself `row`, if there is one in the cells around.
     #[inline(always)]
-    #[allow(clippy::inline_always, clippy::needless_bitwise_bool)] // the inner loop of every search, without branches
-    fn look<const SKIP: bool>(&mut self, points: &[Vec<f32>; 3], run: Range<usize>, q: [f32; 3], skip: u32) {
-        let [px, py, pz] = points.each_ref().map(Vec::as_slice);
-        for start in run.step_by(LANES) {
-            let (x, y, z) = (&px[start..start + LANES], &py[start..start + LANES], &pz[start..start + LANES]);
-            for k in 0..LANES {
-                let d = [x[k] - q[0], y[k] - q[1], z[k] - q[2]];
-                let dist_sq = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-                let at = (start + k) as u32;
-                let nearer = (dist_sq < self.dist_sq[k]) & (!SKIP | (at != skip));
-                self.dist_sq[k] = if nearer { dist_sq } else { self.dist_sq[k] };
-                self.at[k] = if nearer { at } else { self.at[k] };
+    #[allow(clippy::inline_always)] // the body of the loop below
+    fn near_other<S: Simd>(&self, simd: S, place: [f32; 3], row: u32) -> Option<u32> {
+        let seen = SEEN * self.grid.cell_size();
+        let mut search = Search::new(simd, self, place, f32::INFINITY);
+        for run in self.grid.block(place) {
+            search.look::<true>(run, row);
+        }
+        search.row_within(seen).or_else(
+            #[inline(always)]
+            || {
+                for run in self.grid.wide_block(place) {
+                    search.look::<true>(run, row);
+                }
+                search.row_within(2.0 * seen)
+            },
+        )
+    }
+
+    /// The row of the point nearest to that at `place`, which is itself `row`, of two or more.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // as above
+    fn nearest_other<S: Simd>(&self, simd: S, place: [f32; 3], row: u32) -> u32 {
+        let mut search = Search::new(simd, self, place, f32::INFINITY);
+        let mut radius = 0.5 * self.grid.cell_size();
+        loop {
+            for run in self.grid.around(place, radius) {
+                search.look::<true>(run, row);
             }
+            // No columns are wider than 4 of their units.
+            if let Some(other) = search.row_within(if radius > 4.0 { f32::INFINITY } else { radius }) {
+                return other;
+            }
+            radius *= 2.0;
+        }
+    }
+}
+
+/// The loop of [`Sorted::spacings`].
+struct Spacings<'a> {
+    sorted: &'a Sorted,
+    coarser: Option<&'a Sorted>,
+    rows: &'a [Point3<f64>],
+    positions: &'a [u32],
+}
+
+impl WithSimd for Spacings<'_> {
+    type Output = Vec<f64>;
+
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
+    fn with_simd<S: Simd>(self, simd: S) -> Vec<f64> {
+        let sorted = self.sorted;
+        let spacing = |&at: &u32| {
+            let row = sorted.rows[at as usize];
+            let place = sorted.points.each_ref().map(|axis| axis[at as usize]);
+            let other = match sorted.near_other(simd, place, row) {
+                Some(other) => other,
+                None => self.coarser.unwrap_or(sorted).nearest_other(simd, place, row),
+            };
+            (self.rows[row as usize] - self.rows[other as usize]).norm()
+        };
+        self.positions.iter().map(spacing).collect()
+    }
+}
+
+/// What [`Grid::block`] holds for sure, in cells: half a one, less what rounding may cost.
+const SEEN: f32 = 0.499;
+
+/// A search for the point nearest to a place: the best so far, lane by lane.
+struct Search<'a, S: Simd> {
+    simd: S,
+    sorted: &'a Sorted,
+    place: [S::f32s; 3],
+    dist_sq: S::f32s,
+    row: S::u32s,
+}
+
+impl<'a, S: Simd> Search<'a, S> {
+    #[inline(always)]
+    #[allow(clippy::inline_always)]
+    fn new(simd: S, sorted: &'a Sorted, place: [f32; 3], within_sq: f32) -> Self {
+        Self {
+            simd,
+            sorted,
+            place: place.map(|x| simd.splat_f32s(x)),
+            dist_sq: simd.splat_f32s(within_sq),
+            row: simd.splat_u32s(NONE),
         }
     }
 
-    /// The nearest of all lanes, its place in the order and squared distance.
+    /// Looks at the points of `run`, and at a few beyond its end: other points of the cloud, which do no harm. With
+    /// `SKIP` not at the row `skip`.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // the inner loop of every search
+    fn look<const SKIP: bool>(&mut self, run: Range<usize>, skip: u32) {
+        let simd = self.simd;
+        for start in run.step_by(S::F32_LANES) {
+            let lanes = start..start + S::F32_LANES;
+            let gap_sq = |axis: usize| {
+                let x = S::as_simd_f32s(&self.sorted.points[axis][lanes.clone()]).0[0];
+                let gap = simd.sub_f32s(x, self.place[axis]);
+                simd.mul_f32s(gap, gap)
+            };
+            let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
+            let row = S::as_simd_u32s(&self.sorted.rows[lanes]).0[0];
+            let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
+            if SKIP {
+                let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
+                nearer = simd.and_m32s(nearer, other);
+            }
+            self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
+            self.row = simd.select_u32s(nearer, row, self.row);
+        }
+    }
+
+    /// The row of the nearest of all lanes, if that is within `distance`.
     #[inline(always)]
     #[allow(clippy::inline_always)]
-    fn first(&self) -> Option<(usize, f32)> {
-        let least = self.dist_sq.iter().copied().fold(f32::INFINITY, f32::min);
-        let lanes = self.dist_sq.iter().zip(&self.at);
-        // Lanes that saw nothing hold the largest value and the bound that they began with.
-        let at = lanes
-            .map(|(&dist_sq, &at)| if dist_sq.to_bits() == least.to_bits() { at } else { NONE })
-            .fold(NONE, u32::min);
-        (at != NONE).then_some((at as usize, least))
+    fn row_within(&self, distance: f32) -> Option<u32> {
+        self.first().filter(|&(_, dist_sq)| dist_sq <= distance * distance).map(|(row, _)| row)
+    }
+
+    /// The nearest of all lanes, its row and squared distance.
+    #[inline(always)]
+    #[allow(clippy::inline_always)]
+    fn first(&self) -> Option<(u32, f32)> {
+        let least = self.simd.reduce_min_f32s(self.dist_sq);
+        // Lanes that saw nothing hold the bound that they began with, and are the least only if none saw anything.
+        let lane = self.simd.first_true_m32s(self.simd.equal_f32s(self.dist_sq, self.simd.splat_f32s(least)));
+        let row = bytemuck::cast_slice::<_, u32>(std::slice::from_ref(&self.row))[lane];
+        (row != NONE).then_some((row, least))
     }
 }

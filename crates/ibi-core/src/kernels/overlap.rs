@@ -146,7 +146,7 @@ fn each_place(
         (!is_hidden).then_some((i, moved))
     });
     let normals = source.normals.zip(target.normals);
-    nearby.nearest_each(visible, |i, moved, row| {
+    nearby.nearest_each(contact.distance, visible, |i, moved, row| {
         let on =
             row.map(|row| (row, (moved - target.points[row as usize]).norm())).filter(|&(row, distance)| {
                 let agree = |(n, m): (&[Vector3<f64>], &[Vector3<f64>])| {

@@ -4,7 +4,13 @@
 //! [`simd`] is compiled a second and a third time for newer vector units (AVX2, AVX-512), and the best copy that the
 //! processor has is taken. Nothing is computed in another order or fused, so the bits stay the same.
 
+//!
+//! Where the compiler does not see the vectors by itself, a loop is written with those of [`Simd`], as the
+//! [`WithSimd`] of a type, and run by [`dispatch`].
+
 use std::sync::LazyLock;
+
+pub(crate) use pulp::{Simd, WithSimd, bytemuck};
 
 static ARCH: LazyLock<pulp::Arch> = LazyLock::new(pulp::Arch::new);
 
@@ -12,5 +18,12 @@ static ARCH: LazyLock<pulp::Arch> = LazyLock::new(pulp::Arch::new);
 #[inline(always)]
 #[allow(clippy::inline_always)] // `job` must be seen through
 pub(crate) fn simd<T>(job: impl FnOnce() -> T) -> T {
+    ARCH.dispatch(job)
+}
+
+/// Runs `job` with the widest vector units at hand, which it is told.
+#[inline(always)]
+#[allow(clippy::inline_always)]
+pub(crate) fn dispatch<J: WithSimd>(job: J) -> J::Output {
     ARCH.dispatch(job)
 }

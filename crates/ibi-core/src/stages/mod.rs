@@ -12,13 +12,14 @@ use std::sync::OnceLock;
 
 use nalgebra::Isometry3;
 
+use crate::claims::Claims;
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::rng::Rng;
 use crate::params::{Params, Refine};
-use crate::scene::{Claims, Detail, Scene};
+use crate::scene::{Detail, Scene};
 
 /// SCS: picks from the alive correspondences a few that are highly consistent with each other.
 pub trait SelectSeeds: Send + Sync {
@@ -122,8 +123,7 @@ impl Context<'_> {
     /// nearest source point and the distance in data units. At a glance only some: every so many-th of those around.
     fn near(&self, detail: Detail, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Near {
         let scene = self.scene;
-        let radius = scene.source.radius + self.length(distance_pr);
-        let around = self.pairs.by_target.within(&(target_from_source * scene.source.centre), radius);
+        let around = self.around(distance_pr, target_from_source);
         let ids: Vec<u32> = around.filter(|&id| self.alive.contains(id)).collect();
         let step = match detail {
             Detail::Glance => ids.len().div_ceil(GLANCE_NEAR).max(1),
@@ -131,6 +131,17 @@ impl Context<'_> {
         };
         let targets = ids.iter().step_by(step).map(|&id| (id, self.pairs.target[id as usize]));
         Near { found: scene.nearest_source(distance_pr, target_from_source, targets), step: step as u32 }
+    }
+
+    /// Correspondences whose target point lies within `distance_pr` of the ball around the moved source.
+    pub(crate) fn around(
+        &self,
+        distance_pr: f64,
+        target_from_source: &Isometry3<f64>,
+    ) -> impl Iterator<Item = u32> + use<'_> {
+        let source = self.scene.source;
+        let radius = source.radius + self.length(distance_pr);
+        self.pairs.by_target.within(&(target_from_source * source.centre), radius)
     }
 
     /// What speaks for a pose: the alive correspondences, and the scene points, if `exclusive` only those that no
@@ -160,9 +171,9 @@ impl Context<'_> {
                 })
                 .count(),
         };
-        let fit = self
-            .scene
-            .fit(self.params, detail, target_from_source, |row| exclusive && self.claims.contains(row));
+        let claims = self.claims.near(target_from_source);
+        let fit =
+            self.scene.fit(self.params, detail, target_from_source, |row| exclusive && claims.contains(row));
         Support {
             num_explained: (num_explained as u32 * step).max(num_agreeing as u32),
             num_agreeing: num_agreeing as u32,

@@ -37,9 +37,10 @@ impl Overlap {
 impl Validate for Overlap {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
         let mut places = context.scene.places(context.params, &hypothesis.target_from_source);
-        if self.exclusive {
+        let claims = context.claims.near(&hypothesis.target_from_source);
+        if self.exclusive && !claims.is_empty() {
             for place in &mut places {
-                if matches!(place, Place::On(row) if context.claims.contains(*row)) {
+                if matches!(place, Place::On(row) if claims.contains(*row)) {
                     *place = Place::Free;
                 }
             }
