@@ -89,10 +89,11 @@ def test_a_round_is_typed_throughout(found):
     accepted = sum(entry.accepted for entry in found.rounds)
     # In a contest several rounds may come to one instance.
     assert accepted == len(found) if found.params.n_contest == 1 else accepted >= len(found)
-    counts = {f.name for f in fields(ibi.Round)} - {"hypothesis_score", "verdict"}
+    counts = {f.name for f in fields(ibi.Round)} - {"capped", "hypothesis_score", "verdict"}
     for entry in found.rounds:
         assert isinstance(entry, ibi.Round)
         assert {type(getattr(entry, name)) for name in counts} == {int}
+        assert entry.capped is False
         assert type(entry.hypothesis_score) is float
         assert isinstance(entry.verdict, ibi.Verdict)
         assert entry.accepted == entry.verdict.accepted == (entry.verdict.value > entry.verdict.threshold)
@@ -392,6 +393,11 @@ SHAPES = {name: ibi.synth.shape(name, 1000, np.random.default_rng(9)) for name i
 def described(points, normals):
     """Where a point lies on its shape, and how it faces: cheap descriptors."""
     return np.hstack([points, 0.1 * normals])
+
+
+def test_a_round_says_that_a_limit_was_hit():
+    for te in (ibi.SacCot(max_triangles=1), ibi.Mac(max_steps=1)):
+        assert register(PAPER.replace(te=te)).rounds[0].capped is True
 
 
 def test_the_joint_check_drops_poses_that_live_on_what_others_own():

@@ -170,6 +170,72 @@ class Ransac:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SacCot:
+    """TE ``sac_cot``: the most compatible triangles give a pose each; the best MAE wins (Eq. 7-8).
+
+    The triangles are those of the compatibility graph over the dense correspondences C_d, of which at most the
+    1024 best-ranked are its nodes.
+
+    Parameters
+    ----------
+    n_sac_cot
+        Triangles tried, those with the largest sum of compatibilities; 1 to 1,000,000.
+    d_cmp_pr
+        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr; > 0.
+    t_cmp
+        t_cmp: least compatibility of an edge; 0 to 1.
+    max_triangles
+        Triangles looked at, at most; a round that has come so far is ``capped``. 1 to 1,000,000,000.
+    min_height_pr
+        Triangles whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
+
+    References
+    ----------
+    Yang et al., "SAC-COT: Sample Consensus by Sampling Compatibility Triangles in Graphs for 3-D Point Cloud
+    Registration", 2021.
+    """
+
+    variant: ClassVar[str] = "sac_cot"
+    n_sac_cot: int = 100
+    d_cmp_pr: float = 10.0
+    t_cmp: float = 0.9
+    max_triangles: int = 1_000_000
+    min_height_pr: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mac:
+    """TE ``mac``: maximal cliques of compatible correspondences give a pose each; the best MAE wins (Eq. 7-8).
+
+    The graph is the second-order compatibility graph over the dense correspondences C_d, of which at most the
+    1024 best-ranked are its nodes. Of the maximal cliques that hold a node the heaviest is tried.
+
+    Parameters
+    ----------
+    d_cmp_pr
+        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr; > 0.
+    t_cmp
+        t_cmp: least compatibility of an edge of the first order; 0 to 1.
+    t_sog
+        Least weight of an edge of the second order, as a share of the largest; 0 to 1.
+    max_cliques, max_steps
+        Maximal cliques and steps of the search, at most; a round that has come so far is ``capped``. 1 to
+        1,000,000,000 each.
+
+    References
+    ----------
+    Zhang et al., "3D Registration with Maximal Cliques", 2023.
+    """
+
+    variant: ClassVar[str] = "mac"
+    d_cmp_pr: float = 10.0
+    t_cmp: float = 0.9
+    t_sog: float = 0.5
+    max_cliques: int = 10_000
+    max_steps: int = 20_000
+
+
+@dataclass(frozen=True, kw_only=True)
 class Overlap:
     """HV ``overlap``: accepts a pose if enough source points come to lie within ``d_op`` of a target point.
 
@@ -242,7 +308,7 @@ class None_:
 
 Scs = Gtm | LocalGtm
 Ce = Voting | Off
-Te = Gsac | Irls | Ransac
+Te = Gsac | Irls | Ransac | SacCot | Mac
 Hv = Evidence | Overlap | InlierCount | None_
 Refine = Literal["none", "icp"]
 Removal = Literal["dense", "inliers"]

@@ -283,6 +283,7 @@ impl<'a> State<'a> {
             num_dense: dense.len() as u32,
             num_samples: estimate.num_samples,
             num_degenerate: estimate.num_degenerate,
+            capped: estimate.capped,
             hypothesis_score: hypothesis.map(|h| h.score),
             verdict,
             num_removed: self.problem.remove(removed),

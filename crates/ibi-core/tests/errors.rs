@@ -6,7 +6,7 @@ use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::stages::ce::Voting;
 use ibi_core::stages::hv::{Evidence, InlierCount, Overlap};
 use ibi_core::stages::scs::Gtm;
-use ibi_core::stages::te::{Gsac, Ransac};
+use ibi_core::stages::te::{Gsac, Mac, Ransac, SacCot};
 use ibi_core::{Argument, Cloud, Correspondences, Error, Params, Registrar, Registration, StopReason};
 use ibi_testkit::scenes::{Recipe, Scene};
 
@@ -339,6 +339,20 @@ fn bad_params() -> Vec<BadParam> {
     all.push(bad(ransac, "te.n_ransac", 0.0, "at least 1"));
     let ransac = |p: &mut Params| p.te = Ransac { n_ransac: 10_000_001, ..Ransac::default() }.into();
     all.push(bad(ransac, "te.n_ransac", 10_000_001.0, "at most 10,000,000"));
+    let sac_cot = |p: &mut Params| p.te = SacCot { n_sac_cot: 0, ..SacCot::default() }.into();
+    all.push(bad(sac_cot, "te.n_sac_cot", 0.0, "at least 1"));
+    let sac_cot = |p: &mut Params| p.te = SacCot { t_cmp: 1.1, ..SacCot::default() }.into();
+    all.push(bad(sac_cot, "te.t_cmp", 1.1, SHARE));
+    let sac_cot = |p: &mut Params| p.te = SacCot { max_triangles: 0, ..SacCot::default() }.into();
+    all.push(bad(sac_cot, "te.max_triangles", 0.0, "at least 1"));
+    let mac = |p: &mut Params| p.te = Mac { d_cmp_pr: 0.0, ..Mac::default() }.into();
+    all.push(bad(mac, "te.d_cmp_pr", 0.0, "between 1e-9 and 1e9"));
+    let mac = |p: &mut Params| p.te = Mac { t_sog: -0.1, ..Mac::default() }.into();
+    all.push(bad(mac, "te.t_sog", -0.1, SHARE));
+    let mac = |p: &mut Params| p.te = Mac { max_cliques: 1_000_000_001, ..Mac::default() }.into();
+    all.push(bad(mac, "te.max_cliques", 1_000_000_001.0, "at most 1,000,000,000"));
+    let mac = |p: &mut Params| p.te = Mac { max_steps: 0, ..Mac::default() }.into();
+    all.push(bad(mac, "te.max_steps", 0.0, "at least 1"));
     let count = |p: &mut Params| p.hv = InlierCount { t_inliers: 0 }.into();
     all.push(bad(count, "hv.t_inliers", 0.0, "at least 1"));
     all
@@ -380,6 +394,10 @@ fn the_ends_of_the_ranges_are_legal() {
         |p| p.te = Gsac { n_gsac: 1, min_height_pr: 0.0 }.into(),
         |p| p.te = Gsac { min_height_pr: 1e9, ..Gsac::default() }.into(),
         |p| p.te = Ransac { n_ransac: 1, min_height_pr: 0.0 }.into(),
+        |p| p.te = SacCot { n_sac_cot: 1, t_cmp: 0.0, max_triangles: 1, ..SacCot::default() }.into(),
+        |p| p.te = SacCot { d_cmp_pr: 1e-9, t_cmp: 1.0, ..SacCot::default() }.into(),
+        |p| p.te = Mac { t_cmp: 0.0, t_sog: 0.0, max_cliques: 1, max_steps: 1, d_cmp_pr: 1e9 }.into(),
+        |p| p.te = Mac { t_sog: 1.0, max_cliques: 1_000_000_000, ..Mac::default() }.into(),
         |p| p.hv = Overlap { t_overlap: 0.0, ..Overlap::default() }.into(),
         |p| p.hv = Overlap { t_overlap: 1.0, ..Overlap::default() }.into(),
         |p| p.hv = Evidence { t_score: 0.0, ..Evidence::default() }.into(),

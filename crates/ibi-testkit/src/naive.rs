@@ -100,6 +100,41 @@ pub fn top_triplets(scores: &[f32]) -> Vec<[usize; 3]> {
     all
 }
 
+/// Second-order weights of a graph, row-major n x n: w_ij * sum over k of w_ik w_kj.
+#[must_use]
+pub fn second_order(weights: &[f32], n: usize) -> Vec<f64> {
+    let w = |i: usize, j: usize| f64::from(weights[i * n + j]);
+    let second = |i, j| w(i, j) * (0..n).map(|k| w(i, k) * w(k, j)).sum::<f64>();
+    (0..n).flat_map(|i| (0..n).map(move |j| (i, j))).map(|(i, j)| second(i, j)).collect()
+}
+
+/// All triangles of a graph given by its weights, row-major n x n, 0 without an edge; and the sum of the weights of each.
+#[must_use]
+pub fn triangles(weights: &[f32], n: usize) -> Vec<([u32; 3], f64)> {
+    let w = |i: usize, j: usize| f64::from(weights[i * n + j]);
+    let all = (0..n).flat_map(|i| (i + 1..n).flat_map(move |j| (j + 1..n).map(move |k| [i, j, k])));
+    let closed = all.filter(|&[i, j, k]| w(i, j) > 0.0 && w(i, k) > 0.0 && w(j, k) > 0.0);
+    closed.map(|t| (t.map(|i| i as u32), w(t[0], t[1]) + w(t[0], t[2]) + w(t[1], t[2]))).collect()
+}
+
+/// All maximal cliques of three nodes or more, by trying each set of nodes; for graphs of a dozen.
+#[must_use]
+pub fn maximal_cliques(weights: &[f32], n: usize) -> Vec<Vec<u32>> {
+    let joined = |i: usize, j: usize| weights[i * n + j] > 0.0;
+    let has = |set: u32, i: usize| set >> i & 1 == 1;
+    let is_clique = |set: u32| (0..n).all(|i| (0..i).all(|j| !has(set, i) || !has(set, j) || joined(i, j)));
+    let is_maximal = |set: u32| (0..n).all(|i| has(set, i) || !is_clique(set | 1 << i));
+    let sets = (0..1_u32 << n).filter(|&set| set.count_ones() >= 3 && is_clique(set) && is_maximal(set));
+    sets.map(|set| (0..n as u32).filter(|&i| has(set, i as usize)).collect()).collect()
+}
+
+/// The sum of the weights of a clique.
+#[must_use]
+pub fn clique_weight(weights: &[f32], n: usize, clique: &[u32]) -> f64 {
+    let pairs = clique.iter().flat_map(|&i| clique.iter().map(move |&j| (i, j))).filter(|(i, j)| i < j);
+    pairs.map(|(i, j)| f64::from(weights[i as usize * n + j as usize])).sum()
+}
+
 /// |T p - q| of each pair.
 #[must_use]
 pub fn residuals(pairs: &[Pair], pose: &Isometry3<f64>) -> Vec<f64> {

@@ -310,6 +310,8 @@ pub struct Estimate {
     pub num_samples: u32,
     /// Samples skipped because their points were too near to one line.
     pub num_degenerate: u32,
+    /// Whether a limit of the stage ended its search early: there may be better samples than those tried.
+    pub capped: bool,
 }
 
 /// A measured value against its threshold.
