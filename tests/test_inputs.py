@@ -267,6 +267,7 @@ REFUSED = [
     ({"similarity": put(np.ones(M), 4, NAN)}, A, r"similarity\[4\] is NaN; it must be finite"),
     ({"similarity": put(np.ones(M), 4, -INF)}, A, r"similarity\[4\] is -inf; it must be finite"),
     ({"similarity": ["high"] * M}, T, rf"similarity has dtype <U4{REAL}"),
+    ({"params": ibi.Params(scs="nnsr")}, A, r"similarity is not given, .* params.scs needs it; give it"),
     ({"viewpoint": (0, 0)}, A, r"viewpoint has shape \(2,\); it must be \(3,\)"),
     ({"viewpoint": [[0, 0, 0]]}, A, r"viewpoint has shape \(1, 3\); it must be \(3,\)"),
     ({"viewpoint": (0, NAN, 0)}, A, rf"viewpoint\[0\] is .*NaN.*{FINITE}"),
@@ -349,13 +350,19 @@ FRUITLESS = {
 @pytest.mark.parametrize(("given", "reason"), FRUITLESS.values(), ids=FRUITLESS)
 def test_finding_nothing_is_an_answer(given, reason, params, capfd):
     """Even where every pose is accepted what fixes no pose gives none, and above all no identity."""
-    found = register(**given, params=params)
+    is_nnsr = params is not None and isinstance(params.scs, ibi.Nnsr)
+    corr = given.get("corr", CORR)
+    similarity = np.ones(0 if isinstance(corr, tuple) else len(corr)) if is_nnsr else None
+    found = register(**given, params=params, similarity=similarity)
     assert len(found) == 0
     assert np.asarray(found).shape == (0, 4, 4)
     assert (found.labels == -1).all()
     allowed = ("few_seeds", "few_correspondences") if reason is None else (reason,)
     # `gtm` has no leader that a round could bar, and without a hypothesis nothing is removed.
     if reason is None and params and params.removal == "inliers" and isinstance(params.scs, ibi.Gtm):
+        allowed += ("stalled",)
+    # Nor do seeds that need not agree leave anything to be removed.
+    if reason is None and is_nnsr:
         allowed += ("stalled",)
     assert found.stop_reason.name in allowed
     if found.stop_reason.name != "stalled":

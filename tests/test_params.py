@@ -262,6 +262,7 @@ REFUSED = [
     ({"scs": ibi.LocalGtm(min_length_pr=-1)}, "params.scs.min_length_pr is -1; it must be 0 or between"),
     ({"scs": ibi.LocalGtm(normal_tolerance=0)}, "params.scs.normal_tolerance is 0; it must be between"),
     ({"scs": ibi.LocalGtm(second_order=0)}, f"params.scs.second_order is 0; {BOOL}"),
+    ({"scs": ibi.Nnsr(n_nnsr=2)}, "params.scs.n_nnsr is 2; it must be at least 3"),
     ({"ce": ibi.Voting(n_vot=2)}, "params.ce.n_vot is 2; it must be at least 3"),
     ({"ce": ibi.Voting(n_vot=300.5)}, f"params.ce.n_vot is 300.5; {INT}"),
     ({"te": ibi.Gsac(n_gsac=0)}, "params.te.n_gsac is 0; it must be at least 1"),

@@ -231,7 +231,8 @@ try:
 except ibi.ParamsError as error:
     print(error)
 else:
-    print(ibi.register(scene.src, scene.tgt, scene.corr, params, timeout_s=0.5))
+    similarity = [1.0] * len(scene.corr)
+    print(ibi.register(scene.src, scene.tgt, scene.corr, params, similarity=similarity, timeout_s=0.5))
 """
 
 

@@ -88,6 +88,27 @@ class LocalGtm:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Nnsr:
+    """SCS ``nnsr``: the correspondences with the best nearest-neighbour similarity ratio are the seeds.
+
+    Needs ``similarity``, one for each correspondence. Seeds that may not lead again, with removal
+    ``"inliers"``, give way to the next.
+
+    Parameters
+    ----------
+    n_nnsr
+        Seeds of a round; at least 3.
+
+    References
+    ----------
+    Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004.
+    """
+
+    variant: ClassVar[str] = "nnsr"
+    n_nnsr: int = 20
+
+
+@dataclass(frozen=True, kw_only=True)
 class Voting:
     """CE ``voting``: every seed votes for every alive correspondence by their consistency (Eq. 5-6).
 
@@ -306,7 +327,7 @@ class None_:
     variant: ClassVar[str] = "none"
 
 
-Scs = Gtm | LocalGtm
+Scs = Gtm | LocalGtm | Nnsr
 Ce = Voting | Off
 Te = Gsac | Irls | Ransac | SacCot | Mac
 Hv = Evidence | Overlap | InlierCount | None_

@@ -70,6 +70,14 @@ pub enum Error {
         /// Its value.
         value: f64,
     },
+    /// The seed selection cannot do without an argument that was not given.
+    #[error(
+        "{argument} is not given, and the seed selection of params.scs needs it; give it, or take another variant"
+    )]
+    Missing {
+        /// The argument.
+        argument: Argument,
+    },
     /// All points of a cloud coincide, so no length scale can be taken from it.
     #[error("all points of {argument} coincide; a resolution cannot be estimated from it")]
     NoExtent {

@@ -5,7 +5,7 @@ use ibi_core::kernels::compatibility::Payoff;
 use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::stages::ce::Voting;
 use ibi_core::stages::hv::{Evidence, InlierCount, Overlap};
-use ibi_core::stages::scs::Gtm;
+use ibi_core::stages::scs::{Gtm, Nnsr};
 use ibi_core::stages::te::{Gsac, Mac, Ransac, SacCot};
 use ibi_core::{Argument, Cloud, Correspondences, Error, Params, Registrar, Registration, StopReason};
 use ibi_testkit::scenes::{Recipe, Scene};
@@ -272,6 +272,19 @@ fn similarities_must_fit() {
     }
 }
 
+#[test]
+fn a_selection_by_similarity_needs_one() {
+    let mut input = Input::good();
+    input.params.scs = Nnsr::default().into();
+    assert_fails(
+        &input,
+        &Error::Missing { argument: Argument::Similarity },
+        "similarity is not given, and the seed selection of params.scs needs it; give it, or take another variant",
+    );
+    input.correspondences = input.correspondences.with_similarity(easy().similarity());
+    assert!(input.register().is_ok());
+}
+
 /// (what to change, the parameter blamed, its value, what is allowed).
 type BadParam = (Box<dyn Fn(&mut Params)>, &'static str, f64, &'static str);
 
@@ -329,6 +342,7 @@ fn bad_params() -> Vec<BadParam> {
         all.push(bad(move |p| p.ce = Voting { n_vot: n }.into(), "ce.n_vot", n.into(), "at least 3"));
         all.push(bad(gtm, "scs.n_downsample", n.into(), "at least 3"));
     }
+    all.push(bad(|p| p.scs = Nnsr { n_nnsr: 2 }.into(), "scs.n_nnsr", 2.0, "at least 3"));
     let gtm = |p: &mut Params| p.scs = Gtm { n_downsample: 16_385, ..Gtm::default() }.into();
     all.push(bad(gtm, "scs.n_downsample", 16_385.0, "at most 16384 (1 GiB of payoffs)"));
     let gtm = |p: &mut Params| p.scs = Gtm { n_gtm: 0, ..Gtm::default() }.into();

@@ -13,6 +13,7 @@ use std::sync::OnceLock;
 use nalgebra::Isometry3;
 
 use crate::correspondence::{Alive, PointPairs};
+use crate::error::Argument;
 use crate::interrupt::Interrupt;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
@@ -24,6 +25,12 @@ use crate::scene::{Claims, Detail, Scene};
 pub trait SelectSeeds: Send + Sync {
     /// The seeds `C_s`; empty when there are none.
     fn select_seeds(&self, context: &Context<'_>) -> Ranked;
+
+    /// An optional argument of the registration without which this selection cannot do; a run that lacks it is refused
+    /// at its begin. By default there is none.
+    fn needs(&self) -> Option<Argument> {
+        None
+    }
 }
 
 /// CE: gathers the alive correspondences that agree with the seeds.

@@ -2,11 +2,14 @@
 
 mod gtm;
 mod local_gtm;
+mod nnsr;
 
 pub use gtm::Gtm;
 pub use local_gtm::LocalGtm;
+pub use nnsr::Nnsr;
 
 use super::{Context, Ranked, SelectSeeds, variants};
+use crate::error::Argument;
 
 variants! {
     /// The ways to select seeds.
@@ -15,6 +18,8 @@ variants! {
         Gtm = "gtm",
         /// Game-theoretic matching in one neighbourhood at a time.
         LocalGtm = "local_gtm",
+        /// The most distinctive matches.
+        Nnsr = "nnsr",
     }
 }
 
@@ -23,6 +28,14 @@ impl SelectSeeds for Scs {
         match self {
             Self::Gtm(gtm) => gtm.select_seeds(context),
             Self::LocalGtm(local_gtm) => local_gtm.select_seeds(context),
+            Self::Nnsr(nnsr) => nnsr.select_seeds(context),
+        }
+    }
+
+    fn needs(&self) -> Option<Argument> {
+        match self {
+            Self::Nnsr(nnsr) => nnsr.needs(),
+            Self::Gtm(_) | Self::LocalGtm(_) => None,
         }
     }
 }
