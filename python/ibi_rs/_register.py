@@ -53,8 +53,8 @@ def register(
         where ``min_normal_cos`` is set, by inliers, refinement and overlap: :meth:`Params.single_view`.
     similarity : (M,) array_like, optional
         How alike the two descriptors of each correspondence are, on any scale; larger is better. Used by
-        :class:`Nnsr`, which cannot do without. A good choice is 1 - d1 / d2, with d1 and d2 the distances to the
-        nearest and to the second nearest descriptor.
+        :class:`Nnsr`, which cannot do without. A good choice is 1 - d1 / d2, with d1 and d2 the distances to
+        the nearest and to the second nearest descriptor.
     viewpoint : (3,) array_like, optional
         Where the depth camera stood, in the frame of ``tgt``. With normals that count, only source points
         that face it count in the overlap.
@@ -74,8 +74,8 @@ def register(
     Raises
     ------
     InputError
-        An array has a wrong shape, a value that is not finite, or an index out of range, or a variant needs one
-        that is not given; the message names the argument, the place and what is allowed. A ValueError.
+        An array has a wrong shape, a value that is not finite, or an index out of range, or a variant needs
+        one that is not given; the message names the argument, the place and what is allowed. A ValueError.
     ParamsError
         A parameter is out of range. A ValueError.
     TypeError

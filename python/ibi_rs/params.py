@@ -194,8 +194,8 @@ class Ransac:
 class SacCot:
     """TE ``sac_cot``: the most compatible triangles give a pose each; the best MAE wins (Eq. 7-8).
 
-    The triangles are those of the compatibility graph over the dense correspondences C_d, of which at most the
-    1024 best-ranked are its nodes.
+    The triangles are those of the compatibility graph over the dense correspondences C_d, of which at most
+    the 1024 best-ranked are its nodes.
 
     Parameters
     ----------
@@ -208,7 +208,8 @@ class SacCot:
     max_triangles
         Triangles looked at, at most; a round that has come so far is ``capped``. 1 to 1,000,000,000.
     min_height_pr
-        Triangles whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
+        Triangles whose points are this near to one line, on either side, are skipped and counted, in pr;
+        >= 0.
 
     References
     ----------
@@ -226,7 +227,7 @@ class SacCot:
 
 @dataclass(frozen=True, kw_only=True)
 class Mac:
-    """TE ``mac``: maximal cliques of compatible correspondences give a pose each; the best MAE wins (Eq. 7-8).
+    """TE ``mac``: maximal cliques of the compatibility graph give a pose each; the best MAE wins (Eq. 7-8).
 
     The graph is the second-order compatibility graph over the dense correspondences C_d, of which at most the
     1024 best-ranked are its nodes. Of the maximal cliques that hold a node the heaviest is tried.

@@ -108,8 +108,8 @@ class Round:
     num_samples, num_degenerate : int
         Samples drawn by the transformation estimation, and those of them skipped as degenerate.
     capped : bool
-        Whether a limit ended the search for samples early, such as ``max_triangles`` of :class:`SacCot`: there
-        may be better ones.
+        Whether a limit ended the search for samples early, such as ``max_triangles`` of :class:`SacCot`;
+        there may be better ones.
     hypothesis_score : float or None
         Score of the hypothesis; None if there was none.
     verdict : Verdict or None
