@@ -683,6 +683,26 @@ def test_a_model_with_normals_wants_those_of_the_scene_too():
         ibi.Model(SCENE.src, normals=normals[1:])
 
 
+def test_a_model_keeps_its_frames():
+    """Exact ones: each a rotation at random, turned with its instance."""
+    rng, n = np.random.default_rng(2), len(SCENE.src)
+    src_frames = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    src_frames *= np.linalg.det(src_frames)[:, None, None]
+    tgt_frames = np.tile(np.eye(3), (len(SCENE.tgt), 1, 1))
+    for k, pose in enumerate(SCENE.poses):
+        tgt_frames[k * n : (k + 1) * n] = src_frames @ pose[:3, :3].T
+    params = PAPER.replace(scs="hough3d")
+    direct = register(params, src_frames=src_frames.astype("f4"), tgt_frames=tgt_frames)
+    assert direct.rounds[0].num_seeds > 50
+    assert metrics.score_scene(direct, SCENE.poses).recall > 0.7
+    model = ibi.Model(SCENE.src, frames=src_frames.astype("f4"))
+    for one in (model, pickle.loads(pickle.dumps(model))):
+        assert content(one.register(SCENE.tgt, SCENE.corr, params, tgt_frames=tgt_frames)) == content(direct)
+        assert one.frames.shape == (n, 3, 3)
+        with pytest.raises(ibi.InputError, match="tgt_frames"):
+            one.register(SCENE.tgt, SCENE.corr, params)
+
+
 def test_a_model_survives_a_pickle_and_changes_of_the_callers_arrays():
     src = SCENE.src.copy()
     model = ibi.Model(src)

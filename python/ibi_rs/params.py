@@ -109,6 +109,32 @@ class Nnsr:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Hough3d:
+    """SCS ``hough3d``: the correspondences that put the centroid of the source into one place are the seeds.
+
+    Each votes for a place by the local reference frames at its two points. Frames that are not given to
+    :func:`register` are computed from the clouds.
+
+    Parameters
+    ----------
+    bin_pr
+        Width of a cell of the accumulator, in pr; > 0.
+    frame_radius_pr
+        Radius of the neighbourhood that a frame is computed from, in pr; > 0. Unused where frames are given.
+
+    References
+    ----------
+    Tombari & Di Stefano, "Object Recognition in 3D Scenes with Occlusions and Clutter by Hough Voting", 2010.
+    Tombari, Salti & Di Stefano, "Unique Signatures of Histograms for Local Surface Description", 2010, for
+    the frames.
+    """
+
+    variant: ClassVar[str] = "hough3d"
+    bin_pr: float = 2.0
+    frame_radius_pr: float = 6.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Voting:
     """CE ``voting``: every seed votes for every alive correspondence by their consistency (Eq. 5-6).
 
@@ -328,7 +354,7 @@ class None_:
     variant: ClassVar[str] = "none"
 
 
-Scs = Gtm | LocalGtm | Nnsr
+Scs = Gtm | LocalGtm | Nnsr | Hough3d
 Ce = Voting | Off
 Te = Gsac | Irls | Ransac | SacCot | Mac
 Hv = Evidence | Overlap | InlierCount | None_

@@ -138,7 +138,8 @@ pub enum StopReason {
     /// The observer or the cancel token ended it.
     Cancelled,
     /// A round removed and barred nothing, so the next might repeat it for ever. The global game (`gtm`) with
-    /// removal `inliers` can come to this, and with removal `dense` seeds that do not support each other (`nnsr`).
+    /// removal `inliers` can come to this, and with removal `dense` seeds that do not support each other
+    /// (`nnsr`, `hough3d`).
     Stalled,
 }
 

@@ -49,6 +49,7 @@ pub(crate) struct Problem<'a> {
     /// For each row of the target the instance that explains it.
     pub(crate) owners: Vec<u32>,
     pub(crate) graph: OnceLock<Graph>,
+    pub(crate) votes: OnceLock<Vec<Option<[f32; 3]>>>,
     pub(crate) chance: OnceLock<Chance>,
     pub(crate) interrupt: Interrupt,
 }
@@ -117,6 +118,7 @@ impl<'a> Problem<'a> {
             barred,
             owners,
             graph: OnceLock::new(),
+            votes: OnceLock::new(),
             chance: OnceLock::new(),
             interrupt,
         }
@@ -186,6 +188,7 @@ impl<'a> Problem<'a> {
             barred: &self.barred,
             claims,
             graph: &self.graph,
+            votes: &self.votes,
             chance: &self.chance,
             interrupt: &self.interrupt,
         }

@@ -5,7 +5,7 @@ use ibi_core::kernels::compatibility::Payoff;
 use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::stages::ce::Voting;
 use ibi_core::stages::hv::{Evidence, InlierCount, Overlap};
-use ibi_core::stages::scs::{Gtm, Nnsr};
+use ibi_core::stages::scs::{Gtm, Hough3d, Nnsr};
 use ibi_core::stages::te::{Gsac, Mac, Ransac, SacCot};
 use ibi_core::{Argument, Cloud, Correspondences, Error, Params, Registrar, Registration, StopReason};
 use ibi_testkit::scenes::{Recipe, Scene};
@@ -342,6 +342,10 @@ fn bad_params() -> Vec<BadParam> {
         all.push(bad(move |p| p.ce = Voting { n_vot: n }.into(), "ce.n_vot", n.into(), "at least 3"));
         all.push(bad(gtm, "scs.n_downsample", n.into(), "at least 3"));
     }
+    let hough = |p: &mut Params| p.scs = Hough3d { bin_pr: 0.0, ..Hough3d::default() }.into();
+    all.push(bad(hough, "scs.bin_pr", 0.0, "between 1e-9 and 1e9"));
+    let hough = |p: &mut Params| p.scs = Hough3d { frame_radius_pr: 2e9, ..Hough3d::default() }.into();
+    all.push(bad(hough, "scs.frame_radius_pr", 2e9, "between 1e-9 and 1e9"));
     all.push(bad(|p| p.scs = Nnsr { n_nnsr: 2 }.into(), "scs.n_nnsr", 2.0, "at least 3"));
     let gtm = |p: &mut Params| p.scs = Gtm { n_downsample: 16_385, ..Gtm::default() }.into();
     all.push(bad(gtm, "scs.n_downsample", 16_385.0, "at most 16384 (1 GiB of payoffs)"));
@@ -403,6 +407,8 @@ fn the_ends_of_the_ranges_are_legal() {
         |p| p.timeout_s = Some(1e9),
         |p| p.scs = Gtm { n_downsample: 3, n_gtm: 1, payoff: Payoff::Ratio }.into(),
         |p| p.scs = Gtm { n_downsample: 16_384, ..Gtm::default() }.into(),
+        |p| p.scs = Hough3d { bin_pr: 1e-9, frame_radius_pr: 1e9 }.into(),
+        |p| p.scs = Hough3d { bin_pr: 1e9, frame_radius_pr: 1e-9 }.into(),
         |p| p.ce = Voting { n_vot: 3 }.into(),
         |p| p.ce = Voting { n_vot: u32::MAX }.into(),
         |p| p.te = Gsac { n_gsac: 1, min_height_pr: 0.0 }.into(),

@@ -86,6 +86,9 @@ pub struct Context<'a> {
     pub claims: Claims<'a>,
     /// The compatibility graph of all correspondences, built by the first stage that wants it.
     pub graph: &'a OnceLock<Graph>,
+    /// Where each correspondence puts the centroid of the source, in the frame of the columns, if anywhere; filled by the
+    /// first stage that wants it.
+    pub votes: &'a OnceLock<Vec<Option<[f32; 3]>>>,
     /// What chance brings in this scene.
     pub(crate) chance: &'a OnceLock<Chance>,
     /// Asked by long computations, which may then return anything: the round is thrown away.
