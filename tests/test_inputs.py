@@ -180,6 +180,7 @@ FINITE = r"; coordinates must be finite"
 UNITS = r".* apart; are both in the same unit\?"
 THREADS = r"; it must be an integer from 1 to"
 ONES = {"src_normals": np.ones((N, 3)), "tgt_normals": np.ones((Q, 3))}
+FRAMES = {"src_frames": np.tile(np.eye(3), (N, 1, 1)), "tgt_frames": np.tile(np.eye(3), (Q, 1, 1))}
 
 # What is given, the exception, and a pattern that its message must begin with.
 REFUSED = [
@@ -260,6 +261,16 @@ REFUSED = [
             ({**ONES, name: ONES[name].astype(str)}, T, rf"{name} has dtype <U\d+{REAL}"),
         ]
     ),
+    ({"src_frames": FRAMES["src_frames"]}, A, r"src_frames is given but tgt_frames is not; .*both"),
+    (
+        {**FRAMES, "tgt_frames": FRAMES["tgt_frames"][1:]},
+        A,
+        rf"tgt_frames has {Q - 1} rows; .* {Q} rows of tgt",
+    ),
+    ({**FRAMES, "src_frames": np.eye(3)}, A, r"src_frames has shape \(3, 3\); it must be \(N, 3, 3\)"),
+    ({**FRAMES, "src_frames": -FRAMES["src_frames"]}, A, r"src_frames\[0\] is no rotation; its rows must be"),
+    ({**FRAMES, "tgt_frames": put(FRAMES["tgt_frames"], (4, 1), NAN)}, A, r"tgt_frames\[4\] is no rotation"),
+    ({**FRAMES, "tgt_frames": [["x"]]}, T, rf"tgt_frames has dtype <U1{REAL}"),
     ({"similarity": np.ones(M - 1)}, A, rf"similarity has {M - 1} rows; .* each of the {M} rows of corr"),
     ({"similarity": []}, A, rf"similarity has 0 rows; .* each of the {M} rows of corr"),
     ({"similarity": np.ones((M, 1))}, A, rf"similarity has shape \({M}, 1\); it must be \(M,\)"),
@@ -267,6 +278,7 @@ REFUSED = [
     ({"similarity": put(np.ones(M), 4, NAN)}, A, r"similarity\[4\] is NaN; it must be finite"),
     ({"similarity": put(np.ones(M), 4, -INF)}, A, r"similarity\[4\] is -inf; it must be finite"),
     ({"similarity": ["high"] * M}, T, rf"similarity has dtype <U4{REAL}"),
+    ({"params": ibi.Params(scs="nnsr")}, A, r"similarity is not given, .* params.scs needs it; give it"),
     ({"viewpoint": (0, 0)}, A, r"viewpoint has shape \(2,\); it must be \(3,\)"),
     ({"viewpoint": [[0, 0, 0]]}, A, r"viewpoint has shape \(1, 3\); it must be \(3,\)"),
     ({"viewpoint": (0, NAN, 0)}, A, rf"viewpoint\[0\] is .*NaN.*{FINITE}"),
@@ -349,13 +361,19 @@ FRUITLESS = {
 @pytest.mark.parametrize(("given", "reason"), FRUITLESS.values(), ids=FRUITLESS)
 def test_finding_nothing_is_an_answer(given, reason, params, capfd):
     """Even where every pose is accepted what fixes no pose gives none, and above all no identity."""
-    found = register(**given, params=params)
+    is_nnsr = params is not None and isinstance(params.scs, ibi.Nnsr)
+    corr = given.get("corr", CORR)
+    similarity = np.ones(0 if isinstance(corr, tuple) else len(corr)) if is_nnsr else None
+    found = register(**given, params=params, similarity=similarity)
     assert len(found) == 0
     assert np.asarray(found).shape == (0, 4, 4)
     assert (found.labels == -1).all()
     allowed = ("few_seeds", "few_correspondences") if reason is None else (reason,)
     # `gtm` has no leader that a round could bar, and without a hypothesis nothing is removed.
     if reason is None and params and params.removal == "inliers" and isinstance(params.scs, ibi.Gtm):
+        allowed += ("stalled",)
+    # Nor do seeds that need not agree leave anything to be removed.
+    if reason is None and params and isinstance(params.scs, (ibi.Nnsr, ibi.Hough3d)):
         allowed += ("stalled",)
     assert found.stop_reason.name in allowed
     if found.stop_reason.name != "stalled":

@@ -54,6 +54,10 @@ LONG = {
     "scs, many players": ibi.Params(scs=ibi.Gtm(n_downsample=16_384, n_gtm=10_000)),
     "scs, dense graph": ibi.Params(scs=ibi.LocalGtm(tau_pr=3, max_degree=1_000_000)),
     "te, many samples": ibi.Params(te=ibi.Ransac(n_ransac=10_000_000)),
+    "te, many triangles": ibi.Params(
+        ce=ibi.Voting(n_vot=1024), te=ibi.SacCot(n_sac_cot=1_000_000, t_cmp=0, max_triangles=1_000_000_000)
+    ),
+    "te, many cliques": ibi.Params(te=ibi.Mac(t_sog=0, max_cliques=1_000_000_000, max_steps=1_000_000_000)),
 }
 each_long = pytest.mark.parametrize("name", LONG)
 
@@ -227,7 +231,8 @@ try:
 except ibi.ParamsError as error:
     print(error)
 else:
-    print(ibi.register(scene.src, scene.tgt, scene.corr, params, timeout_s=0.5))
+    similarity = [1.0] * len(scene.corr)
+    print(ibi.register(scene.src, scene.tgt, scene.corr, params, similarity=similarity, timeout_s=0.5))
 """
 
 

@@ -24,9 +24,13 @@ def scene_of(seed):
 
 
 SCENE = scene_of(0)
+# True pairs are the more alike on average.
+SIMILARITY = np.random.default_rng(0).random(len(SCENE.corr)) + 0.3 * (SCENE.labels() >= 0)
 
 
 def register(params=PAPER, *, corr=SCENE.corr, **options):
+    if params.scs.variant == "nnsr":
+        options.setdefault("similarity", SIMILARITY)
     return ibi.register(SCENE.src, SCENE.tgt, corr, params, **options)
 
 
@@ -89,10 +93,11 @@ def test_a_round_is_typed_throughout(found):
     accepted = sum(entry.accepted for entry in found.rounds)
     # In a contest several rounds may come to one instance.
     assert accepted == len(found) if found.params.n_contest == 1 else accepted >= len(found)
-    counts = {f.name for f in fields(ibi.Round)} - {"hypothesis_score", "verdict"}
+    counts = {f.name for f in fields(ibi.Round)} - {"capped", "hypothesis_score", "verdict"}
     for entry in found.rounds:
         assert isinstance(entry, ibi.Round)
         assert {type(getattr(entry, name)) for name in counts} == {int}
+        assert entry.capped is False
         assert type(entry.hypothesis_score) is float
         assert isinstance(entry.verdict, ibi.Verdict)
         assert entry.accepted == entry.verdict.accepted == (entry.verdict.value > entry.verdict.threshold)
@@ -394,6 +399,11 @@ def described(points, normals):
     return np.hstack([points, 0.1 * normals])
 
 
+def test_a_round_says_that_a_limit_was_hit():
+    for te in (ibi.SacCot(max_triangles=1), ibi.Mac(max_steps=1)):
+        assert register(PAPER.replace(te=te)).rounds[0].capped is True
+
+
 def test_the_joint_check_drops_poses_that_live_on_what_others_own():
     """Almost everything is accepted, at once: wrong early poses, which the right ones then take apart."""
     params = PLAIN.replace(hv=ibi.Evidence(t_score=1e-4), n_contest=1)
@@ -671,6 +681,26 @@ def test_a_model_with_normals_wants_those_of_the_scene_too():
         model.register(SCENE.tgt, SCENE.corr)
     with pytest.raises(ibi.InputError, match="src_normals"):
         ibi.Model(SCENE.src, normals=normals[1:])
+
+
+def test_a_model_keeps_its_frames():
+    """Exact ones: each a rotation at random, turned with its instance."""
+    rng, n = np.random.default_rng(2), len(SCENE.src)
+    src_frames = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    src_frames *= np.linalg.det(src_frames)[:, None, None]
+    tgt_frames = np.tile(np.eye(3), (len(SCENE.tgt), 1, 1))
+    for k, pose in enumerate(SCENE.poses):
+        tgt_frames[k * n : (k + 1) * n] = src_frames @ pose[:3, :3].T
+    params = PAPER.replace(scs="hough3d")
+    direct = register(params, src_frames=src_frames.astype("f4"), tgt_frames=tgt_frames)
+    assert direct.rounds[0].num_seeds > 50
+    assert metrics.score_scene(direct, SCENE.poses).recall > 0.7
+    model = ibi.Model(SCENE.src, frames=src_frames.astype("f4"))
+    for one in (model, pickle.loads(pickle.dumps(model))):
+        assert content(one.register(SCENE.tgt, SCENE.corr, params, tgt_frames=tgt_frames)) == content(direct)
+        assert one.frames.shape == (n, 3, 3)
+        with pytest.raises(ibi.InputError, match="tgt_frames"):
+            one.register(SCENE.tgt, SCENE.corr, params)
 
 
 def test_a_model_survives_a_pickle_and_changes_of_the_callers_arrays():

@@ -54,7 +54,9 @@ def params_from_toml(text: str) -> str: ...
 class Source:
     """A source that was checked and prepared."""
 
-    def __new__(cls, points: _Floats, normals: _Floats | None = None) -> Source: ...
+    def __new__(
+        cls, points: _Floats, normals: _Floats | None = None, frames: _Floats | None = None
+    ) -> Source: ...
     @property
     def spacing(self) -> float: ...
     @property
@@ -67,6 +69,7 @@ def register(
     params: str,
     *,
     tgt_normals: _Floats | None = None,
+    tgt_frames: _Floats | None = None,
     similarity: _Floats | None = None,
     viewpoint: Sequence[float] | None = None,
     num_threads: int | None = None,

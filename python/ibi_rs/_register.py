@@ -29,6 +29,8 @@ def register(
     *,
     src_normals: npt.ArrayLike | None = None,
     tgt_normals: npt.ArrayLike | None = None,
+    src_frames: npt.ArrayLike | None = None,
+    tgt_frames: npt.ArrayLike | None = None,
     similarity: npt.ArrayLike | None = None,
     viewpoint: npt.ArrayLike | None = None,
     num_threads: int | None = None,
@@ -51,8 +53,13 @@ def register(
     src_normals, tgt_normals : (N, 3) array_like, optional
         Normals of both clouds, or of neither; any length but 0. Used by the local game (``LocalGtm``) and,
         where ``min_normal_cos`` is set, by inliers, refinement and overlap: :meth:`Params.single_view`.
+    src_frames, tgt_frames : (N, 3, 3) array_like, optional
+        Local reference frames of both clouds, or of neither: at each point three unit axes, as rows,
+        right-handed. Used by :class:`Hough3d`, which computes them where they are not given.
     similarity : (M,) array_like, optional
-        How alike the two descriptors of each correspondence are; larger is better. No variant uses it yet.
+        How alike the two descriptors of each correspondence are, on any scale; larger is better. Used by
+        :class:`Nnsr`, which cannot do without. A good choice is 1 - d1 / d2, with d1 and d2 the distances to
+        the nearest and to the second nearest descriptor.
     viewpoint : (3,) array_like, optional
         Where the depth camera stood, in the frame of ``tgt``. With normals that count, only source points
         that face it count in the overlap.
@@ -72,8 +79,8 @@ def register(
     Raises
     ------
     InputError
-        An array has a wrong shape, a value that is not finite, or an index out of range; the message names
-        the argument, the place and what is allowed. A ValueError.
+        An array has a wrong shape, a value that is not finite, or an index out of range, or a variant needs
+        one that is not given; the message names the argument, the place and what is allowed. A ValueError.
     ParamsError
         A parameter is out of range. A ValueError.
     TypeError
@@ -97,12 +104,13 @@ def register(
     >>> found[0].target_from_source.shape
     (4, 4)
     """
-    model = Model(src, normals=src_normals)
+    model = Model(src, normals=src_normals, frames=src_frames)
     return model.register(
         tgt,
         corr,
         params,
         tgt_normals=tgt_normals,
+        tgt_frames=tgt_frames,
         similarity=similarity,
         viewpoint=viewpoint,
         num_threads=num_threads,
@@ -124,11 +132,13 @@ class Model:
         The model, as in :func:`register`.
     normals : (N, 3) array_like, optional
         Its normals; any length but 0.
+    frames : (N, 3, 3) array_like, optional
+        Its local reference frames, as in :func:`register`.
 
     Raises
     ------
     InputError
-        As :func:`register`, of ``src`` and ``src_normals``.
+        As :func:`register`, of ``src``, ``src_normals`` and ``src_frames``.
     TypeError
         As :func:`register`.
 
@@ -141,12 +151,20 @@ class Model:
     5
     """
 
-    def __init__(self, src: Points, *, normals: npt.ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        src: Points,
+        *,
+        normals: npt.ArrayLike | None = None,
+        frames: npt.ArrayLike | None = None,
+    ) -> None:
         points = _points("src", src)
         of_points = None if normals is None else _points("src_normals", normals)
-        self._source = _core.Source(points, of_points)
+        axes = None if frames is None else _frames("src_frames", frames)
+        self._source = _core.Source(points, of_points, axes)
         # Copies: the caller's arrays may change, the prepared source does not.
         self._points, self._normals = _frozen(points), None if of_points is None else _frozen(of_points)
+        self._frames = None if axes is None else _frozen(axes)
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
@@ -157,6 +175,11 @@ class Model:
     def normals(self) -> npt.NDArray[np.float64] | None:
         """(N, 3) as given, or None; read-only."""
         return self._normals
+
+    @property
+    def frames(self) -> npt.NDArray[np.float64] | None:
+        """(N, 3, 3) as given, or None; read-only."""
+        return self._frames
 
     @property
     def spacing(self) -> float:
@@ -176,10 +199,10 @@ class Model:
         return f"Model({len(self)} points, {normals} normals, spacing {self.spacing:.4g})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"points": self._points, "normals": self._normals}
+        return {"points": self._points, "normals": self._normals, "frames": self._frames}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        Model.__init__(self, state["points"], normals=state["normals"])
+        Model.__init__(self, state["points"], normals=state["normals"], frames=state["frames"])
 
     def register(
         self,
@@ -188,6 +211,7 @@ class Model:
         params: Params | None = None,
         *,
         tgt_normals: npt.ArrayLike | None = None,
+        tgt_frames: npt.ArrayLike | None = None,
         similarity: npt.ArrayLike | None = None,
         viewpoint: npt.ArrayLike | None = None,
         num_threads: int | None = None,
@@ -213,6 +237,7 @@ class Model:
             _correspondences(corr),
             json.dumps(params.to_dict()),
             tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
+            tgt_frames=None if tgt_frames is None else _frames("tgt_frames", tgt_frames),
             similarity=None if similarity is None else _vector("similarity", similarity),
             viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
             num_threads=_num_threads(num_threads),
@@ -281,6 +306,13 @@ def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:
         raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
+    return _aligned(array, np.float64)
+
+
+def _frames(name: str, value: Any) -> npt.NDArray[np.float64]:
+    array = _real(name, value)
+    if array.ndim != 3 or array.shape[1:] != (3, 3):
+        raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, 3, 3)")
     return _aligned(array, np.float64)
 
 

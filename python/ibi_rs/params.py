@@ -88,6 +88,53 @@ class LocalGtm:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Nnsr:
+    """SCS ``nnsr``: the correspondences with the best nearest-neighbour similarity ratio are the seeds.
+
+    Needs ``similarity``, one for each correspondence. Seeds that may not lead again, with removal
+    ``"inliers"``, give way to the next.
+
+    Parameters
+    ----------
+    n_nnsr
+        Seeds of a round; at least 3.
+
+    References
+    ----------
+    Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004.
+    """
+
+    variant: ClassVar[str] = "nnsr"
+    n_nnsr: int = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hough3d:
+    """SCS ``hough3d``: the correspondences that put the centroid of the source into one place are the seeds.
+
+    Each votes for a place by the local reference frames at its two points. Frames that are not given to
+    :func:`register` are computed from the clouds.
+
+    Parameters
+    ----------
+    bin_pr
+        Width of a cell of the accumulator, in pr; > 0.
+    frame_radius_pr
+        Radius of the neighbourhood that a frame is computed from, in pr; > 0. Unused where frames are given.
+
+    References
+    ----------
+    Tombari & Di Stefano, "Object Recognition in 3D Scenes with Occlusions and Clutter by Hough Voting", 2010.
+    Tombari, Salti & Di Stefano, "Unique Signatures of Histograms for Local Surface Description", 2010, for
+    the frames.
+    """
+
+    variant: ClassVar[str] = "hough3d"
+    bin_pr: float = 2.0
+    frame_radius_pr: float = 6.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Voting:
     """CE ``voting``: every seed votes for every alive correspondence by their consistency (Eq. 5-6).
 
@@ -170,6 +217,73 @@ class Ransac:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SacCot:
+    """TE ``sac_cot``: the most compatible triangles give a pose each; the best MAE wins (Eq. 7-8).
+
+    The triangles are those of the compatibility graph over the dense correspondences C_d, of which at most
+    the 1024 best-ranked are its nodes.
+
+    Parameters
+    ----------
+    n_sac_cot
+        Triangles tried, those with the largest sum of compatibilities; 1 to 1,000,000.
+    d_cmp_pr
+        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr; > 0.
+    t_cmp
+        t_cmp: least compatibility of an edge; 0 to 1.
+    max_triangles
+        Triangles looked at, at most; a round that has come so far is ``capped``. 1 to 1,000,000,000.
+    min_height_pr
+        Triangles whose points are this near to one line, on either side, are skipped and counted, in pr;
+        >= 0.
+
+    References
+    ----------
+    Yang et al., "SAC-COT: Sample Consensus by Sampling Compatibility Triangles in Graphs for 3-D Point Cloud
+    Registration", 2021.
+    """
+
+    variant: ClassVar[str] = "sac_cot"
+    n_sac_cot: int = 100
+    d_cmp_pr: float = 10.0
+    t_cmp: float = 0.9
+    max_triangles: int = 1_000_000
+    min_height_pr: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mac:
+    """TE ``mac``: maximal cliques of the compatibility graph give a pose each; the best MAE wins (Eq. 7-8).
+
+    The graph is the second-order compatibility graph over the dense correspondences C_d, of which at most the
+    1024 best-ranked are its nodes. Of the maximal cliques that hold a node the heaviest is tried.
+
+    Parameters
+    ----------
+    d_cmp_pr
+        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr; > 0.
+    t_cmp
+        t_cmp: least compatibility of an edge of the first order; 0 to 1.
+    t_sog
+        Least weight of an edge of the second order, as a share of the largest; 0 to 1.
+    max_cliques, max_steps
+        Maximal cliques and steps of the search, at most; a round that has come so far is ``capped``. 1 to
+        1,000,000,000 each.
+
+    References
+    ----------
+    Zhang et al., "3D Registration with Maximal Cliques", 2023.
+    """
+
+    variant: ClassVar[str] = "mac"
+    d_cmp_pr: float = 10.0
+    t_cmp: float = 0.9
+    t_sog: float = 0.5
+    max_cliques: int = 10_000
+    max_steps: int = 20_000
+
+
+@dataclass(frozen=True, kw_only=True)
 class Overlap:
     """HV ``overlap``: accepts a pose if enough source points come to lie within ``d_op`` of a target point.
 
@@ -240,9 +354,9 @@ class None_:
     variant: ClassVar[str] = "none"
 
 
-Scs = Gtm | LocalGtm
+Scs = Gtm | LocalGtm | Nnsr | Hough3d
 Ce = Voting | Off
-Te = Gsac | Irls | Ransac
+Te = Gsac | Irls | Ransac | SacCot | Mac
 Hv = Evidence | Overlap | InlierCount | None_
 Refine = Literal["none", "icp"]
 Removal = Literal["dense", "inliers"]

@@ -107,6 +107,9 @@ class Round:
         Size of C_d.
     num_samples, num_degenerate : int
         Samples drawn by the transformation estimation, and those of them skipped as degenerate.
+    capped : bool
+        Whether a limit ended the search for samples early, such as ``max_triangles`` of :class:`SacCot`;
+        there may be better ones.
     hypothesis_score : float or None
         Score of the hypothesis; None if there was none.
     verdict : Verdict or None
@@ -123,6 +126,7 @@ class Round:
     num_dense: int
     num_samples: int
     num_degenerate: int
+    capped: bool
     hypothesis_score: float | None
     verdict: Verdict | None
     num_removed: int

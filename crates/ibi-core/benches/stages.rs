@@ -41,6 +41,10 @@ fn scene(num_correspondences: usize) -> Scene {
     Recipe::sized(num_correspondences, 0.5, 5).build()
 }
 
+fn correspondences(scene: &Scene) -> Correspondences {
+    Correspondences::from_rows(scene.rows.clone()).with_similarity(scene.similarity())
+}
+
 fn settings(c: &mut Criterion, name: &str, mut run: impl FnMut(&mut Group<'_>)) {
     let mut group = c.benchmark_group(name);
     group.sample_size(10).warm_up_time(Duration::from_millis(200));
@@ -70,7 +74,7 @@ fn in_a_run<T: Send + 'static>(scene: &Scene, job: impl Fn(&Context<'_>) -> T + 
         .params(Params { t_he_pr: 3.0, ..Params::paper_synthetic() })
         .num_threads(1)
         .with_scs(Probe(move |context: &Context<'_>| *slot.lock().unwrap() = Some(job(context))))
-        .register(&Cloud::new(&scene.target), &Correspondences::from_rows(scene.rows.clone()))
+        .register(&Cloud::new(&scene.target), &correspondences(scene))
         .unwrap();
     result.lock().unwrap().take().expect("the probe was called")
 }

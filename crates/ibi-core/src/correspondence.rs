@@ -47,6 +47,12 @@ impl Correspondences {
         self
     }
 
+    /// Whether a similarity was given.
+    #[must_use]
+    pub fn has_similarity(&self) -> bool {
+        self.similarity.is_some()
+    }
+
     /// Rows of the clouds, source and target; where points are given instead, those of the nearest points.
     fn rows(&self, scene: &Scene<'_>) -> (Vec<u32>, Vec<u32>) {
         let side = |cloud: &PreparedCloud<'_>, column: usize| match &self.pairs {

@@ -50,6 +50,22 @@ pub enum Error {
         /// The array that was not.
         missing: Argument,
     },
+    /// A local reference frame is no rotation.
+    #[error("{argument}[{row}] is no rotation; its rows must be orthonormal to 1e-3 and right-handed")]
+    NotARotation {
+        /// `src_frames` or `tgt_frames`.
+        argument: Argument,
+        /// First offending row.
+        row: usize,
+    },
+    /// Frames were given for one cloud only.
+    #[error("{given} is given but {missing} is not; give frames for both clouds or for neither")]
+    FramesOfOneCloud {
+        /// The array that was given.
+        given: Argument,
+        /// The array that was not.
+        missing: Argument,
+    },
     /// A correspondence points outside of a cloud.
     #[error("corr[{row}, {column}] is {index}; {} has rows 0 to {}", if *column == 0 { "src" } else { "tgt" }, len.saturating_sub(1))]
     IndexOutOfRange {
@@ -69,6 +85,14 @@ pub enum Error {
         row: usize,
         /// Its value.
         value: f64,
+    },
+    /// The seed selection cannot do without an argument that was not given.
+    #[error(
+        "{argument} is not given, and the seed selection of params.scs needs it; give it, or take another variant"
+    )]
+    Missing {
+        /// The argument.
+        argument: Argument,
     },
     /// All points of a cloud coincide, so no length scale can be taken from it.
     #[error("all points of {argument} coincide; a resolution cannot be estimated from it")]
@@ -131,6 +155,10 @@ pub enum Argument {
     SrcNormals,
     /// Normals of the target.
     TgtNormals,
+    /// Local reference frames of the source.
+    SrcFrames,
+    /// Local reference frames of the target.
+    TgtFrames,
     /// A similarity for each correspondence.
     Similarity,
     /// Where the depth camera stood.
@@ -145,6 +173,8 @@ impl std::fmt::Display for Argument {
             Self::Corr => "corr",
             Self::SrcNormals => "src_normals",
             Self::TgtNormals => "tgt_normals",
+            Self::SrcFrames => "src_frames",
+            Self::TgtFrames => "tgt_frames",
             Self::Similarity => "similarity",
             Self::Viewpoint => "viewpoint",
         })

@@ -164,8 +164,8 @@ impl<'a> Registrar<'a> {
     /// Checks parameters and input, builds what all rounds share.
     ///
     /// # Errors
-    /// If a parameter is out of range; if the target is as bad as a source may be (see [`Self::new`]); if a
-    /// correspondence points outside of a cloud; if only one cloud has normals; if the clouds cannot be in the
+    /// If a parameter is out of range; if the seed selection needs a similarity and there is none; if the target is as bad
+    /// as a source may be (see [`Self::new`]); if a correspondence points outside of a cloud; if only one cloud has normals or frames; if the clouds cannot be in the
     /// same unit; if the threads cannot be started.
     pub fn begin<'s>(
         &'s self,
@@ -174,9 +174,13 @@ impl<'a> Registrar<'a> {
     ) -> Result<State<'s>, Error> {
         let start = Instant::now();
         self.params.validate()?;
+        if self.scs().needs() == Some(Argument::Similarity) && !correspondences.has_similarity() {
+            return Err(Error::Missing { argument: Argument::Similarity });
+        }
         let pool = Arc::new(Pool::new(self.num_threads)?);
         let (scene, pairs) = pool.install(|| {
-            let target = PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals)?;
+            let target =
+                PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals, Argument::TgtFrames)?;
             let scene = Scene::new(&self.source, target, &self.params)?;
             let pairs = PointPairs::new(correspondences, &scene, self.params.oriented_normals)?;
             Ok::<_, Error>((scene, pairs))

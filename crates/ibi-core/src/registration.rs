@@ -68,6 +68,8 @@ pub struct Round {
     pub num_samples: u32,
     /// Those of them skipped as degenerate.
     pub num_degenerate: u32,
+    /// Whether a limit ended the search for samples early, such as `max_triangles` of `sac_cot`: there may be better ones.
+    pub capped: bool,
     /// Score of the hypothesis; `None` if there was none.
     pub hypothesis_score: Option<f64>,
     /// What validation measured; `None` if there was no hypothesis.
@@ -136,7 +138,8 @@ pub enum StopReason {
     /// The observer or the cancel token ended it.
     Cancelled,
     /// A round removed and barred nothing, so the next might repeat it for ever. The global game (`gtm`) with
-    /// removal `inliers` can come to this.
+    /// removal `inliers` can come to this, and with removal `dense` seeds that do not support each other
+    /// (`nnsr`, `hough3d`).
     Stalled,
 }
 

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::sync::OnceLock;
 
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
 use crate::error::{Argument, Error};
 use crate::kernels::icp::{Stop, icp};
@@ -21,6 +21,7 @@ pub struct Cloud<'a> {
     pub(crate) points: Cow<'a, [Point3<f64>]>,
     pub(crate) normals: Option<Vec<Vector3<f64>>>,
     pub(crate) viewpoint: Option<Point3<f64>>,
+    pub(crate) frames: Option<Vec<Matrix3<f64>>>,
 }
 
 impl<'a> Cloud<'a> {
@@ -34,6 +35,13 @@ impl<'a> Cloud<'a> {
     #[must_use]
     pub fn with_normals(mut self, normals: Vec<Vector3<f64>>) -> Self {
         self.normals = Some(normals);
+        self
+    }
+
+    /// One local reference frame per point, its axes as rows: right-handed, and turning with the cloud.
+    #[must_use]
+    pub fn with_frames(mut self, frames: Vec<Matrix3<f64>>) -> Self {
+        self.frames = Some(frames);
         self
     }
 
@@ -64,6 +72,8 @@ pub struct PreparedCloud<'a> {
     pub points: Cow<'a, [Point3<f64>]>,
     /// Unit normals, one per point.
     pub normals: Option<Vec<Vector3<f64>>>,
+    /// Local reference frames, one per point, if they were given.
+    pub frames: Option<Vec<Matrix3<f64>>>,
     /// Where the depth camera stood.
     pub viewpoint: Option<Point3<f64>>,
     /// Mean distance of a point to its nearest other point, in data units.
@@ -88,11 +98,16 @@ impl<'a> PreparedCloud<'a> {
     /// # Errors
     /// Those of [`crate::Registrar::new`].
     pub fn source(cloud: &Cloud<'a>) -> Result<Self, Error> {
-        Self::new(cloud, Argument::Src, Argument::SrcNormals)
+        Self::new(cloud, Argument::Src, Argument::SrcNormals, Argument::SrcFrames)
     }
 
-    /// Checks `cloud` and builds what the stages need. `argument` and `normals` are what errors call them.
-    pub(crate) fn new(cloud: &Cloud<'a>, argument: Argument, normals: Argument) -> Result<Self, Error> {
+    /// Checks `cloud` and builds what the stages need. `argument`, `normals` and `frames` are what errors call them.
+    pub(crate) fn new(
+        cloud: &Cloud<'a>,
+        argument: Argument,
+        normals: Argument,
+        frames: Argument,
+    ) -> Result<Self, Error> {
         let points = &cloud.points;
         check_points(points, argument)?;
         if points.len() < 3 {
@@ -109,6 +124,9 @@ impl<'a> PreparedCloud<'a> {
             .as_deref()
             .map(|rows| normalised(rows, normals, points.len(), argument))
             .transpose()?;
+        if let Some(rows) = &cloud.frames {
+            check_frames(rows, frames, points.len(), argument)?;
+        }
         let (centre, extent) = bounding_box(points);
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
@@ -118,6 +136,7 @@ impl<'a> PreparedCloud<'a> {
         let radius = (1.0 + 1e-12) * points.iter().map(|p| (p - centre).norm()).fold(0.0, f64::max);
         Ok(Self {
             points: points.clone(),
+            frames: cloud.frames.clone(),
             viewpoint: cloud.viewpoint,
             spacing,
             extent,
@@ -215,6 +234,12 @@ impl<'a> Scene<'a> {
         match (&source.normals, &target.normals) {
             (Some(_), None) => return Err(Error::NormalsOfOneCloud { given: src, missing: tgt }),
             (None, Some(_)) => return Err(Error::NormalsOfOneCloud { given: tgt, missing: src }),
+            _ => {}
+        }
+        let (src, tgt) = (Argument::SrcFrames, Argument::TgtFrames);
+        match (&source.frames, &target.frames) {
+            (Some(_), None) => return Err(Error::FramesOfOneCloud { given: src, missing: tgt }),
+            (None, Some(_)) => return Err(Error::FramesOfOneCloud { given: tgt, missing: src }),
             _ => {}
         }
         // Metres against millimetres would make pr so coarse that a whole cloud fits into one point, and any
@@ -377,6 +402,29 @@ fn normalised(
         n.try_normalize(0.0).ok_or(Error::ZeroNormal { argument, row })
     };
     rows.iter().enumerate().map(unit).collect()
+}
+
+/// How far the axes of a frame may be from orthonormal: frames may come from single precision.
+const FRAME_TOLERANCE: f64 = 1e-3;
+
+fn check_frames(
+    frames: &[Matrix3<f64>],
+    argument: Argument,
+    expected: usize,
+    of: Argument,
+) -> Result<(), Error> {
+    if frames.len() != expected {
+        return Err(Error::LengthMismatch { argument, len: frames.len(), of, expected });
+    }
+    // NaN is no rotation either.
+    let is_rotation = |frame: &Matrix3<f64>| {
+        let off = (frame * frame.transpose() - Matrix3::identity()).amax();
+        off <= FRAME_TOLERANCE && frame.iter().all(|x| x.is_finite()) && frame.determinant() > 0.0
+    };
+    match frames.iter().position(|frame| !is_rotation(frame)) {
+        Some(row) => Err(Error::NotARotation { argument, row }),
+        None => Ok(()),
+    }
 }
 
 /// Centre and diagonal of the bounding box.

@@ -48,6 +48,7 @@ pub(crate) struct Problem<'a> {
     pub(crate) alive: Alive,
     pub(crate) barred: Vec<bool>,
     pub(crate) graph: OnceLock<Graph>,
+    pub(crate) votes: OnceLock<Vec<Option<[f32; 3]>>>,
     pub(crate) chance: OnceLock<Chance>,
     pub(crate) interrupt: Interrupt,
 }
@@ -106,7 +107,16 @@ impl Found {
 impl<'a> Problem<'a> {
     pub(crate) fn new(scene: Scene<'a>, pairs: PointPairs, interrupt: Interrupt) -> Self {
         let (alive, barred) = (Alive::all(&pairs), vec![false; pairs.len()]);
-        Self { scene, pairs, alive, barred, graph: OnceLock::new(), chance: OnceLock::new(), interrupt }
+        Self {
+            scene,
+            pairs,
+            alive,
+            barred,
+            graph: OnceLock::new(),
+            votes: OnceLock::new(),
+            chance: OnceLock::new(),
+            interrupt,
+        }
     }
 
     /// Whether two poses of the source can have to do with the same target points.
@@ -159,6 +169,7 @@ impl<'a> Problem<'a> {
             barred: &self.barred,
             claims: Claims::new(&self.scene, params, found),
             graph: &self.graph,
+            votes: &self.votes,
             chance: &self.chance,
             interrupt: &self.interrupt,
         }
@@ -256,6 +267,7 @@ impl<'a> State<'a> {
             num_dense: dense.len() as u32,
             num_samples: estimate.num_samples,
             num_degenerate: estimate.num_degenerate,
+            capped: estimate.capped,
             hypothesis_score: hypothesis.map(|h| h.score),
             verdict,
             num_removed: self.problem.remove(removed),

@@ -68,7 +68,7 @@ fn planned(plan: Plan, params: Params) -> Registrar<'static> {
             let x = at(plan, context.round).0 as f64;
             let hypothesis =
                 Hypothesis { target_from_source: Isometry3::translation(x, 0.0, 0.0), score: 1.0 };
-            Estimate { hypothesis: Some(hypothesis), num_samples: 1, num_degenerate: 0 }
+            Estimate { hypothesis: Some(hypothesis), num_samples: 1, num_degenerate: 0, capped: false }
         }))
         .with_hv(Mock(move |context: &Context<'_>, hypothesis: &Hypothesis| {
             // Measured again, it is still the hypothesis of its own round.

@@ -5,8 +5,8 @@ use ibi_core::kernels::compatibility::Payoff;
 use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::stages::ce::Voting;
 use ibi_core::stages::hv::{Evidence, InlierCount, Overlap};
-use ibi_core::stages::scs::Gtm;
-use ibi_core::stages::te::{Gsac, Ransac};
+use ibi_core::stages::scs::{Gtm, Hough3d, Nnsr};
+use ibi_core::stages::te::{Gsac, Mac, Ransac, SacCot};
 use ibi_core::{Argument, Cloud, Correspondences, Error, Params, Registrar, Registration, StopReason};
 use ibi_testkit::scenes::{Recipe, Scene};
 
@@ -272,6 +272,19 @@ fn similarities_must_fit() {
     }
 }
 
+#[test]
+fn a_selection_by_similarity_needs_one() {
+    let mut input = Input::good();
+    input.params.scs = Nnsr::default().into();
+    assert_fails(
+        &input,
+        &Error::Missing { argument: Argument::Similarity },
+        "similarity is not given, and the seed selection of params.scs needs it; give it, or take another variant",
+    );
+    input.correspondences = input.correspondences.with_similarity(easy().similarity());
+    assert!(input.register().is_ok());
+}
+
 /// (what to change, the parameter blamed, its value, what is allowed).
 type BadParam = (Box<dyn Fn(&mut Params)>, &'static str, f64, &'static str);
 
@@ -329,6 +342,11 @@ fn bad_params() -> Vec<BadParam> {
         all.push(bad(move |p| p.ce = Voting { n_vot: n }.into(), "ce.n_vot", n.into(), "at least 3"));
         all.push(bad(gtm, "scs.n_downsample", n.into(), "at least 3"));
     }
+    let hough = |p: &mut Params| p.scs = Hough3d { bin_pr: 0.0, ..Hough3d::default() }.into();
+    all.push(bad(hough, "scs.bin_pr", 0.0, "between 1e-9 and 1e9"));
+    let hough = |p: &mut Params| p.scs = Hough3d { frame_radius_pr: 2e9, ..Hough3d::default() }.into();
+    all.push(bad(hough, "scs.frame_radius_pr", 2e9, "between 1e-9 and 1e9"));
+    all.push(bad(|p| p.scs = Nnsr { n_nnsr: 2 }.into(), "scs.n_nnsr", 2.0, "at least 3"));
     let gtm = |p: &mut Params| p.scs = Gtm { n_downsample: 16_385, ..Gtm::default() }.into();
     all.push(bad(gtm, "scs.n_downsample", 16_385.0, "at most 16384 (1 GiB of payoffs)"));
     let gtm = |p: &mut Params| p.scs = Gtm { n_gtm: 0, ..Gtm::default() }.into();
@@ -339,6 +357,20 @@ fn bad_params() -> Vec<BadParam> {
     all.push(bad(ransac, "te.n_ransac", 0.0, "at least 1"));
     let ransac = |p: &mut Params| p.te = Ransac { n_ransac: 10_000_001, ..Ransac::default() }.into();
     all.push(bad(ransac, "te.n_ransac", 10_000_001.0, "at most 10,000,000"));
+    let sac_cot = |p: &mut Params| p.te = SacCot { n_sac_cot: 0, ..SacCot::default() }.into();
+    all.push(bad(sac_cot, "te.n_sac_cot", 0.0, "at least 1"));
+    let sac_cot = |p: &mut Params| p.te = SacCot { t_cmp: 1.1, ..SacCot::default() }.into();
+    all.push(bad(sac_cot, "te.t_cmp", 1.1, SHARE));
+    let sac_cot = |p: &mut Params| p.te = SacCot { max_triangles: 0, ..SacCot::default() }.into();
+    all.push(bad(sac_cot, "te.max_triangles", 0.0, "at least 1"));
+    let mac = |p: &mut Params| p.te = Mac { d_cmp_pr: 0.0, ..Mac::default() }.into();
+    all.push(bad(mac, "te.d_cmp_pr", 0.0, "between 1e-9 and 1e9"));
+    let mac = |p: &mut Params| p.te = Mac { t_sog: -0.1, ..Mac::default() }.into();
+    all.push(bad(mac, "te.t_sog", -0.1, SHARE));
+    let mac = |p: &mut Params| p.te = Mac { max_cliques: 1_000_000_001, ..Mac::default() }.into();
+    all.push(bad(mac, "te.max_cliques", 1_000_000_001.0, "at most 1,000,000,000"));
+    let mac = |p: &mut Params| p.te = Mac { max_steps: 0, ..Mac::default() }.into();
+    all.push(bad(mac, "te.max_steps", 0.0, "at least 1"));
     let count = |p: &mut Params| p.hv = InlierCount { t_inliers: 0 }.into();
     all.push(bad(count, "hv.t_inliers", 0.0, "at least 1"));
     all
@@ -375,11 +407,17 @@ fn the_ends_of_the_ranges_are_legal() {
         |p| p.timeout_s = Some(1e9),
         |p| p.scs = Gtm { n_downsample: 3, n_gtm: 1, payoff: Payoff::Ratio }.into(),
         |p| p.scs = Gtm { n_downsample: 16_384, ..Gtm::default() }.into(),
+        |p| p.scs = Hough3d { bin_pr: 1e-9, frame_radius_pr: 1e9 }.into(),
+        |p| p.scs = Hough3d { bin_pr: 1e9, frame_radius_pr: 1e-9 }.into(),
         |p| p.ce = Voting { n_vot: 3 }.into(),
         |p| p.ce = Voting { n_vot: u32::MAX }.into(),
         |p| p.te = Gsac { n_gsac: 1, min_height_pr: 0.0 }.into(),
         |p| p.te = Gsac { min_height_pr: 1e9, ..Gsac::default() }.into(),
         |p| p.te = Ransac { n_ransac: 1, min_height_pr: 0.0 }.into(),
+        |p| p.te = SacCot { n_sac_cot: 1, t_cmp: 0.0, max_triangles: 1, ..SacCot::default() }.into(),
+        |p| p.te = SacCot { d_cmp_pr: 1e-9, t_cmp: 1.0, ..SacCot::default() }.into(),
+        |p| p.te = Mac { t_cmp: 0.0, t_sog: 0.0, max_cliques: 1, max_steps: 1, d_cmp_pr: 1e9 }.into(),
+        |p| p.te = Mac { t_sog: 1.0, max_cliques: 1_000_000_000, ..Mac::default() }.into(),
         |p| p.hv = Overlap { t_overlap: 0.0, ..Overlap::default() }.into(),
         |p| p.hv = Overlap { t_overlap: 1.0, ..Overlap::default() }.into(),
         |p| p.hv = Evidence { t_score: 0.0, ..Evidence::default() }.into(),

@@ -44,7 +44,7 @@ fn played(plan: Plan, joint_check: bool) -> Registration {
                 target_from_source: Isometry3::translation(x, 0.0, 0.0),
                 score,
             });
-            Estimate { hypothesis, num_samples: 1, num_degenerate: 0 }
+            Estimate { hypothesis, num_samples: 1, num_degenerate: 0, capped: false }
         }))
         .with_hv(Mock(|context: &Context<'_>, hypothesis: &Hypothesis| {
             let x = hypothesis.target_from_source.translation.x.round() as usize;
@@ -115,7 +115,7 @@ fn of_duplicates_one_stays() {
     // Neither claims nor contests keep an instance from being found in every second round.
     let nth = move |context: &Context<'_>, _: &Ranked| {
         let hypothesis = Hypothesis { target_from_source: truth[context.round as usize % 2], score: 1.0 };
-        Estimate { hypothesis: Some(hypothesis), num_samples: 1, num_degenerate: 0 }
+        Estimate { hypothesis: Some(hypothesis), num_samples: 1, num_degenerate: 0, capped: false }
     };
     let found = |joint_check| {
         let params = Params {

@@ -355,6 +355,7 @@ fn always(pose: Isometry3<f64>) -> impl EstimatePose + 'static {
         hypothesis: Some(hypothesis),
         num_samples: 1,
         num_degenerate: 0,
+        capped: false,
     })
 }
 

@@ -37,7 +37,7 @@ fn first_alive(context: &Context<'_>, n: usize) -> Ranked {
 
 fn shifted(x: f64) -> Estimate {
     let hypothesis = Hypothesis { target_from_source: Isometry3::translation(x, 0.0, 0.0), score: 7.0 };
-    Estimate { hypothesis: Some(hypothesis), num_samples: 5, num_degenerate: 2 }
+    Estimate { hypothesis: Some(hypothesis), num_samples: 5, num_degenerate: 2, capped: false }
 }
 
 const ACCEPT: Verdict = Verdict { value: 1.0, threshold: 0.5 };
@@ -166,6 +166,7 @@ fn without_a_hypothesis_nothing_is_validated_but_the_dense_correspondences_go() 
         .with_te(Mock(|_: &Context<'_>, _: &Ranked| Estimate {
             num_samples: 9,
             num_degenerate: 9,
+            capped: true,
             ..Estimate::default()
         }))
         .with_hv(Mock(|_: &Context<'_>, _: &Hypothesis| -> Verdict { unreachable!("nothing to validate") }));
@@ -174,7 +175,7 @@ fn without_a_hypothesis_nothing_is_validated_but_the_dense_correspondences_go() 
     assert_eq!(result.rounds.len(), 10);
     for round in &result.rounds {
         assert_eq!((round.hypothesis_score, round.verdict, round.num_removed), (None, None, 10));
-        assert_eq!((round.num_samples, round.num_degenerate), (9, 9));
+        assert_eq!((round.num_samples, round.num_degenerate, round.capped), (9, 9, true));
     }
 }
 
@@ -198,7 +199,7 @@ fn rounds_record_what_happened() {
         assert_eq!(round.index, index);
         assert_eq!(round.num_alive, 100 - 20 * index);
         assert_eq!((round.num_seeds, round.num_dense, round.num_removed), (10, 20, 20));
-        assert_eq!((round.num_samples, round.num_degenerate), (5, 2));
+        assert_eq!((round.num_samples, round.num_degenerate, round.capped), (5, 2, false));
         assert_eq!(round.hypothesis_score, Some(7.0));
         assert_eq!(round.verdict, Some(if index == 1 { ACCEPT } else { REJECT }));
         assert_eq!(round.accepted(), index == 1);

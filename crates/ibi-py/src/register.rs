@@ -5,9 +5,10 @@ use std::sync::Arc;
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
-use ibi_core::nalgebra::{Point3, Vector3};
+use ibi_core::nalgebra::{Matrix3, Point3, Vector3};
 use ibi_core::{CancelToken, Cloud, Correspondences, PreparedCloud, Registrar, Registration, Round};
-use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::ndarray::ArrayView2;
+use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -29,14 +30,16 @@ struct Source(Arc<PreparedCloud<'static>>);
 #[pymethods]
 impl Source {
     #[new]
-    #[pyo3(signature = (points, normals=None))]
+    #[pyo3(signature = (points, normals=None, frames=None))]
     #[allow(clippy::needless_pass_by_value)] // PyO3 owns
     fn new(
         py: Python<'_>,
         points: PyReadonlyArray2<'_, f64>,
         normals: Option<PyReadonlyArray2<'_, f64>>,
+        frames: Option<PyReadonlyArray3<'_, f64>>,
     ) -> PyResult<Self> {
         let cloud = with_normals(Cloud::from(rows3(&points, Point3::new)?), normals.as_ref())?;
+        let cloud = with_frames(cloud, frames.as_ref())?;
         let prepared = py.detach(|| PreparedCloud::source(&cloud)).map_err(|e| to_py_err(&e))?;
         Ok(Self(Arc::new(prepared)))
     }
@@ -54,7 +57,7 @@ impl Source {
 
 /// See `ibi_rs.register`, which brings its arguments into the shapes and dtypes that are wanted here.
 #[pyfunction(name = "register")]
-#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, similarity=None, viewpoint=None, num_threads=None, on_round=None))]
+#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, tgt_frames=None, similarity=None, viewpoint=None, num_threads=None, on_round=None))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's keyword arguments; PyO3 owns
 fn register_clouds<'py>(
     py: Python<'py>,
@@ -63,6 +66,7 @@ fn register_clouds<'py>(
     corr: &Bound<'py, PyAny>,
     params: &str,
     tgt_normals: Option<PyReadonlyArray2<'py, f64>>,
+    tgt_frames: Option<PyReadonlyArray3<'py, f64>>,
     similarity: Option<PyReadonlyArray1<'py, f64>>,
     viewpoint: Option<[f64; 3]>,
     num_threads: Option<usize>,
@@ -72,7 +76,8 @@ fn register_clouds<'py>(
     let source = Arc::clone(&source.0);
     // Copied, as other threads may write to the array; borrowed from here on, as scenes can be large.
     let tgt = rows3(&tgt, Point3::new)?;
-    let mut target = with_normals(Cloud::new(&tgt), tgt_normals.as_ref())?;
+    let target = with_normals(Cloud::new(&tgt), tgt_normals.as_ref())?;
+    let mut target = with_frames(target, tgt_frames.as_ref())?;
     if let Some(viewpoint) = viewpoint {
         target = target.with_viewpoint(Point3::from(viewpoint));
     }
@@ -151,6 +156,17 @@ fn with_normals<'a>(cloud: Cloud<'a>, normals: Option<&PyReadonlyArray2<'_, f64>
         Some(normals) => cloud.with_normals(rows3(normals, Vector3::new)?),
         None => cloud,
     })
+}
+
+/// (N, 3, 3), the axes of each frame as rows.
+fn with_frames<'a>(cloud: Cloud<'a>, frames: Option<&PyReadonlyArray3<'_, f64>>) -> PyResult<Cloud<'a>> {
+    let Some(frames) = frames else { return Ok(cloud) };
+    let frames = frames.as_array();
+    if frames.shape()[1..] != [3, 3] {
+        return Err(InputError::new_err("frames must be of shape (N, 3, 3)"));
+    }
+    let frame = |rows: ArrayView2<'_, f64>| Matrix3::from_fn(|i, j| rows[[i, j]]);
+    Ok(cloud.with_frames(frames.outer_iter().map(frame).collect()))
 }
 
 fn rows3<T>(array: &PyReadonlyArray2<'_, f64>, row: impl Fn(f64, f64, f64) -> T) -> PyResult<Vec<T>> {

@@ -100,6 +100,79 @@ pub fn top_triplets(scores: &[f32]) -> Vec<[usize; 3]> {
     all
 }
 
+/// The local reference frame at `centre` among `points`, its axes as rows: x, y, z of descending weighted spread, x and z to
+/// the side of the majority. And how far it is from another answer: 0 where rounding may decide.
+#[must_use]
+pub fn frame(points: &[Point3<f64>], centre: &Point3<f64>, radius: f64) -> Option<(Matrix3<f64>, f64)> {
+    let offsets: Vec<Vector3<f64>> = points.iter().map(|p| p - centre).collect();
+    let inside: Vec<&Vector3<f64>> = offsets.iter().filter(|d| d.norm() > 0.0 && d.norm() < radius).collect();
+    let spread: Matrix3<f64> = inside.iter().map(|d| (radius - d.norm()) * **d * d.transpose()).sum();
+    let svd = spread.svd(true, false);
+    let (u, s) = (svd.u.filter(|_| inside.len() >= 4)?, svd.singular_values);
+    let mut margin = (s[0] - s[1]).min(s[1] - s[2]) / s[0];
+    for d in &offsets {
+        margin = margin.min((d.norm() - radius).abs() / radius);
+    }
+    let mut towards_most = |axis: Vector3<f64>| {
+        let along: Vec<f64> = inside.iter().map(|d| axis.dot(d)).collect();
+        let undecided = along.iter().filter(|a| a.abs() < 1e-9 * radius).count();
+        let positive = along.iter().filter(|&&a| a >= 0.0).count();
+        let pull: f64 = inside.iter().zip(&along).map(|(d, a)| (radius - d.norm()) * a).sum();
+        if 2 * positive == along.len() {
+            margin = margin.min(pull.abs() / (radius * radius * along.len() as f64));
+        }
+        if undecided > 0 {
+            margin = 0.0;
+        }
+        let is_turned = 2 * positive < along.len() || (2 * positive == along.len() && pull < 0.0);
+        if is_turned { -axis } else { axis }
+    };
+    let (x, z) = (towards_most(u.column(0).into()), towards_most(u.column(2).into()));
+    Some((Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()]), margin))
+}
+
+/// What each vote adds to the cell with the given corner: 1 at its centre, falling to 0 a width away along each axis.
+#[must_use]
+pub fn hough_shares(votes: &[[f64; 3]], cell: [i64; 3], width: f64) -> Vec<f64> {
+    let tent = |x: f64, c: i64| (1.0 - (x / width - (c as f64 + 0.5)).abs()).max(0.0);
+    votes.iter().map(|vote| (0..3).map(|axis| tent(vote[axis], cell[axis])).product()).collect()
+}
+
+/// Second-order weights of a graph, row-major n x n: w_ij * sum over k of w_ik w_kj.
+#[must_use]
+pub fn second_order(weights: &[f32], n: usize) -> Vec<f64> {
+    let w = |i: usize, j: usize| f64::from(weights[i * n + j]);
+    let second = |i, j| w(i, j) * (0..n).map(|k| w(i, k) * w(k, j)).sum::<f64>();
+    (0..n).flat_map(|i| (0..n).map(move |j| (i, j))).map(|(i, j)| second(i, j)).collect()
+}
+
+/// All triangles of a graph given by its weights, row-major n x n, 0 without an edge; and the sum of the weights of each.
+#[must_use]
+pub fn triangles(weights: &[f32], n: usize) -> Vec<([u32; 3], f64)> {
+    let w = |i: usize, j: usize| f64::from(weights[i * n + j]);
+    let all = (0..n).flat_map(|i| (i + 1..n).flat_map(move |j| (j + 1..n).map(move |k| [i, j, k])));
+    let closed = all.filter(|&[i, j, k]| w(i, j) > 0.0 && w(i, k) > 0.0 && w(j, k) > 0.0);
+    closed.map(|t| (t.map(|i| i as u32), w(t[0], t[1]) + w(t[0], t[2]) + w(t[1], t[2]))).collect()
+}
+
+/// All maximal cliques of three nodes or more, by trying each set of nodes; for graphs of a dozen.
+#[must_use]
+pub fn maximal_cliques(weights: &[f32], n: usize) -> Vec<Vec<u32>> {
+    let joined = |i: usize, j: usize| weights[i * n + j] > 0.0;
+    let has = |set: u32, i: usize| set >> i & 1 == 1;
+    let is_clique = |set: u32| (0..n).all(|i| (0..i).all(|j| !has(set, i) || !has(set, j) || joined(i, j)));
+    let is_maximal = |set: u32| (0..n).all(|i| has(set, i) || !is_clique(set | 1 << i));
+    let sets = (0..1_u32 << n).filter(|&set| set.count_ones() >= 3 && is_clique(set) && is_maximal(set));
+    sets.map(|set| (0..n as u32).filter(|&i| has(set, i as usize)).collect()).collect()
+}
+
+/// The sum of the weights of a clique.
+#[must_use]
+pub fn clique_weight(weights: &[f32], n: usize, clique: &[u32]) -> f64 {
+    let pairs = clique.iter().flat_map(|&i| clique.iter().map(move |&j| (i, j))).filter(|(i, j)| i < j);
+    pairs.map(|(i, j)| f64::from(weights[i as usize * n + j as usize])).sum()
+}
+
 /// |T p - q| of each pair.
 #[must_use]
 pub fn residuals(pairs: &[Pair], pose: &Isometry3<f64>) -> Vec<f64> {

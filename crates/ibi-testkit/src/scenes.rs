@@ -171,6 +171,15 @@ impl Scene {
         Self { name, ..self }
     }
 
+    /// A similarity for each correspondence: those of true pairs are larger on average, and many are equal.
+    #[must_use]
+    pub fn similarity(&self) -> Vec<f64> {
+        let mut rng = Rng::new(8);
+        let similarity =
+            |label: &Option<usize>| (rng.below(50) + if label.is_some() { 30 } else { 0 }) as f64;
+        self.labels.iter().map(similarity).map(|step| step / 80.0).collect()
+    }
+
     /// How many true poses have one of `found` within `rotation_rad` and `distance`.
     #[must_use]
     pub fn hits(&self, found: &[Isometry3<f64>], rotation_rad: f64, distance: f64) -> usize {

@@ -4,11 +4,15 @@
 //! checked at the door, see [`crate::Registrar::begin`]) and give the same bits for any number of threads.
 
 pub mod by_target;
+pub mod cliques;
 pub mod columns;
 pub mod compatibility;
+pub mod dense_graph;
 pub mod evidence;
+pub mod frames;
 pub mod graph;
 pub mod grid;
+pub mod hough;
 pub mod icp;
 pub mod kabsch;
 pub mod mae;
@@ -20,4 +24,5 @@ pub mod par;
 pub mod replicator;
 pub mod rng;
 pub(crate) mod simd;
+pub mod triangles;
 pub mod triplets;

@@ -53,6 +53,11 @@ impl Payoffs {
         &self.values[i * self.stride..][..self.n]
     }
 
+    /// The same, and the zeros after it that fill the last vector.
+    pub(crate) fn padded_row(&self, i: usize) -> &[f32] {
+        &self.values[i * self.stride..][..self.stride]
+    }
+
     /// The rows with all their values: those beyond n play no part, whatever they are.
     pub(crate) fn padded_rows(&mut self) -> impl Iterator<Item = &mut [f32]> {
         self.values.chunks_exact_mut(self.stride)

@@ -14,6 +14,7 @@ use nalgebra::Isometry3;
 
 use crate::claims::Claims;
 use crate::correspondence::{Alive, PointPairs};
+use crate::error::Argument;
 use crate::interrupt::Interrupt;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
@@ -25,6 +26,12 @@ use crate::scene::{Detail, Scene};
 pub trait SelectSeeds: Send + Sync {
     /// The seeds `C_s`; empty when there are none.
     fn select_seeds(&self, context: &Context<'_>) -> Ranked;
+
+    /// An optional argument of the registration without which this selection cannot do; a run that lacks it is refused
+    /// at its begin. By default there is none.
+    fn needs(&self) -> Option<Argument> {
+        None
+    }
 }
 
 /// CE: gathers the alive correspondences that agree with the seeds.
@@ -80,6 +87,9 @@ pub struct Context<'a> {
     pub claims: Claims<'a>,
     /// The compatibility graph of all correspondences, built by the first stage that wants it.
     pub graph: &'a OnceLock<Graph>,
+    /// Where each correspondence puts the centroid of the source, in the frame of the columns, if anywhere; filled by the
+    /// first stage that wants it.
+    pub votes: &'a OnceLock<Vec<Option<[f32; 3]>>>,
     /// What chance brings in this scene.
     pub(crate) chance: &'a OnceLock<Chance>,
     /// Asked by long computations, which may then return anything: the round is thrown away.
@@ -321,6 +331,8 @@ pub struct Estimate {
     pub num_samples: u32,
     /// Samples skipped because their points were too near to one line.
     pub num_degenerate: u32,
+    /// Whether a limit of the stage ended its search early: there may be better samples than those tried.
+    pub capped: bool,
 }
 
 /// A measured value against its threshold.

@@ -64,6 +64,7 @@ impl EstimatePose for Gsac {
             hypothesis: best_of(context, &triplets),
             num_samples,
             num_degenerate: num_samples - triplets.len() as u32,
+            capped: false,
         }
     }
 }

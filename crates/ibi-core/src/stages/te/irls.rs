@@ -52,7 +52,12 @@ impl EstimatePose for Irls {
             }
             Hypothesis { target_from_source: pose, score: mae_of(context, &pose) }
         });
-        Estimate { hypothesis, num_samples: 1, num_degenerate: u32::from(hypothesis.is_none()) }
+        Estimate {
+            hypothesis,
+            num_samples: 1,
+            num_degenerate: u32::from(hypothesis.is_none()),
+            capped: false,
+        }
     }
 }
 

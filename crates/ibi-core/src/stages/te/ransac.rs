@@ -53,6 +53,7 @@ impl EstimatePose for Ransac {
             hypothesis: best_of(context, &triplets),
             num_samples: self.n_ransac,
             num_degenerate: self.n_ransac - triplets.len() as u32,
+            capped: false,
         }
     }
 }
