@@ -22,6 +22,7 @@
 
 mod correspondence;
 mod error;
+pub mod features;
 mod interrupt;
 mod joint;
 pub mod kernels;

@@ -1,0 +1,30 @@
+//! From a mesh and a scan to correspondences: thinning, normals, descriptors, matching.
+//!
+//! What [`crate::Registrar`] wants is two clouds and putative correspondences. This is one way to them, so that a CAD
+//! file and a depth scan suffice:
+//!
+//! | side | steps |
+//! |---|---|
+//! | model | [`voxel_downsample`] |
+//! | scene | [`voxel_downsample`], [`estimate_normals`] |
+//! | both | [`fpfh`], then matching |
+//!
+//! In this crate and not in one beside it, because it lives on the private parts of the kernels: the grid, the vector
+//! units, and the discipline of threads. Functions of arrays, each by itself; they run on the [`Pool`] that they are
+//! called in, on one thread outside of any, and give the same bits on any number. Lengths are in the unit of the data.
+//!
+//! [`Pool`]: crate::kernels::par::Pool
+
+mod around;
+mod door;
+mod error;
+mod fpfh;
+mod normals;
+mod pairs;
+mod voxel;
+
+pub use around::Neighborhood;
+pub use error::FeatureError;
+pub use fpfh::{FPFH_DIM, fpfh};
+pub use normals::estimate_normals;
+pub use voxel::{Thinned, voxel_downsample};

@@ -1,0 +1,206 @@
+//! The features: each against its naive twin, and the laws that hold whatever the data.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::float_cmp,
+    reason = "tests may panic, and compare what is exact"
+)]
+
+use ibi_core::CancelToken;
+use ibi_core::features::{FPFH_DIM, FeatureError, Neighborhood, estimate_normals, fpfh, voxel_downsample};
+use ibi_core::kernels::par::Pool;
+use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
+use ibi_testkit::strategies::{permutations, points, rigid_motions};
+use ibi_testkit::{Rng, features as naive};
+use proptest::prelude::*;
+
+fn never() -> CancelToken {
+    CancelToken::default()
+}
+
+/// A bumpy ball of radius about 1, with normals that are a little off.
+fn ball(count: usize, seed: u64) -> (Vec<Point3<f64>>, Vec<Vector3<f64>>) {
+    let mut rng = Rng::new(seed);
+    let mut point = |_| {
+        let out = rng.normal_vector().normalize();
+        let bump = 1.0 + 0.1 * (5.0 * out.x).sin() * (4.0 * out.y).cos();
+        (Point3::from(out * bump), (out + 0.2 * rng.normal_vector()).normalize())
+    };
+    (0..count).map(&mut point).unzip()
+}
+
+fn in_order<T: Copy>(items: &[T], order: &[usize]) -> Vec<T> {
+    order.iter().map(|&i| items[i]).collect()
+}
+
+/// How many rows differ by more than rounding: an angle that changes its bin changes the row of its point, and a little
+/// those around.
+fn flips(a: &[[f32; FPFH_DIM]], b: &[[f32; FPFH_DIM]]) -> usize {
+    assert_eq!(a.len(), b.len());
+    let off = |(a, b): (&[f32; FPFH_DIM], &[f32; FPFH_DIM])| {
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    };
+    a.iter().zip(b).map(off).filter(|&off| off > 1e-3).count()
+}
+
+// ----------------------------------------------------------------------------------------------------- voxels
+
+proptest! {
+    #[test]
+    fn voxels_are_their_twin(cloud in points(0..60), voxel in 0.05..30.0) {
+        let mut rng = Rng::new(1);
+        let normals: Vec<Vector3<f64>> = cloud.iter().map(|_| rng.normal_vector()).collect();
+        let thin = voxel_downsample(&cloud, Some(&normals), voxel).unwrap();
+        let voxels = naive::voxels(&cloud, voxel);
+        prop_assert_eq!(thin.points.len(), voxels.len());
+        for ((p, n), rows) in thin.points.iter().zip(thin.normals.unwrap()).zip(voxels.values()) {
+            let mean = rows.iter().map(|&row| cloud[row].coords).sum::<Vector3<f64>>() / rows.len() as f64;
+            prop_assert!((p.coords - mean).norm() < 1e-12);
+            let direction = rows.iter().map(|&row| normals[row].normalize()).sum::<Vector3<f64>>();
+            prop_assert!((n - direction.normalize()).norm() < 1e-6 / direction.norm());
+        }
+    }
+}
+
+#[test]
+fn voxels_that_cannot_be_counted_are_refused() {
+    let cloud = [Point3::origin(), Point3::new(1.0, 0.0, 0.0)];
+    let error = voxel_downsample(&cloud, None, 1e-7).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "voxel is 1e-7 and the points are 1e0 across; at most 2097152 voxels fit along an axis"
+    );
+    assert_eq!(voxel_downsample(&cloud, None, 1e-6).unwrap().points.len(), 2);
+}
+
+// ---------------------------------------------------------------------------------------------------- normals
+
+proptest! {
+    // No direction has less spread: the normal itself is not unique on a line.
+    #[test]
+    fn across_a_normal_is_least_spread(cloud in points(0..60), radius in 0.5..20.0, most in 3..40_usize) {
+        let neighborhood = Neighborhood { radius, max_neighbors: most };
+        let normals = estimate_normals(&cloud, neighborhood, None, &never()).unwrap();
+        for (row, n) in normals.iter().enumerate() {
+            prop_assert!((n.norm() - 1.0).abs() < 1e-12);
+            let rows = naive::neighbors(&cloud, row, radius, most);
+            let spread = naive::spread(&cloud, &rows);
+            if rows.len() < 3 || spread.amax() == 0.0 {
+                prop_assert_eq!(*n, Vector3::z());
+                continue;
+            }
+            let least = spread.symmetric_eigenvalues().min();
+            prop_assert!(n.dot(&(spread * n)) < least + 1e-9 * spread.amax(), "{} {}", n, spread);
+            prop_assert!((n.z, n.y, n.x) >= (0.0, 0.0, 0.0));
+        }
+    }
+
+    #[test]
+    fn normals_face_the_viewpoint(cloud in points(3..40), eye in points(1..2)) {
+        let neighborhood = Neighborhood { radius: 8.0, max_neighbors: 20 };
+        for (n, p) in estimate_normals(&cloud, neighborhood, Some(eye[0]), &never()).unwrap().iter().zip(&cloud) {
+            prop_assert!(n.dot(&(eye[0] - p)) >= 0.0);
+        }
+    }
+}
+
+// ------------------------------------------------------------------------------------------------------- FPFH
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(30))]
+
+    #[test]
+    fn fpfh_is_its_twin(seed in 0..1000_u64, radius in 0.1..0.9, most in 2..80_usize) {
+        let (points, normals) = ball(200, seed);
+        let neighborhood = Neighborhood { radius, max_neighbors: most };
+        let ours = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+        let twin: Vec<[f32; FPFH_DIM]> =
+            naive::fpfh(&points, &normals, radius, most).iter().map(|row| row.map(|x| x as f32)).collect();
+        prop_assert!(flips(&ours, &twin) <= 100, "{}", flips(&ours, &twin));
+        prop_assert!(ours.as_flattened().iter().all(|x| (-1e-3..=200.01).contains(x)));
+    }
+
+    #[test]
+    fn fpfh_survives_motion_and_another_order(seed in 0..1000_u64, pose in rigid_motions(100.0), order in permutations(200)) {
+        let (points, normals) = ball(200, seed);
+        let neighborhood = Neighborhood { radius: 0.4, max_neighbors: 50 };
+        let here = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+        let moved: Vec<Point3<f64>> = points.iter().map(|p| pose * p).collect();
+        let turned: Vec<Vector3<f64>> = normals.iter().map(|n| pose * n).collect();
+        prop_assert!(flips(&fpfh(&moved, &turned, neighborhood, None, &never()).unwrap(), &here) <= 100);
+        let (points, normals) = (in_order(&points, &order), in_order(&normals, &order));
+        let shuffled = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+        prop_assert_eq!(flips(&shuffled, &in_order(&here, &order)), 0);
+    }
+}
+
+// Over many pairs: fewer than one angle in a hundred thousand is near enough to an edge for `f32` to move it.
+#[test]
+fn few_angles_change_their_bins() {
+    let (mut rows, mut off) = (0, 0);
+    for seed in 0..10 {
+        let (points, normals) = ball(500, seed);
+        let ours =
+            fpfh(&points, &normals, Neighborhood { radius: 0.3, max_neighbors: 60 }, None, &never()).unwrap();
+        let twin = naive::fpfh(&points, &normals, 0.3, 60);
+        let twin: Vec<_> = twin.iter().map(|row| row.map(|x| x as f32)).collect();
+        (rows, off) = (rows + ours.len(), off + flips(&ours, &twin));
+    }
+    assert!(off <= rows / 50, "{off} of {rows} rows");
+}
+
+#[test]
+fn fpfh_of_key_points_is_that_of_their_rows() {
+    let (points, normals) = ball(600, 3);
+    let neighborhood = Neighborhood { radius: 0.3, max_neighbors: 40 };
+    let all = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+    let rows = [5, 599, 5, 0, 77];
+    let some = fpfh(&points, &normals, neighborhood, Some(&rows), &never()).unwrap();
+    assert_eq!(some, rows.map(|row| all[row]));
+    let error = fpfh(&points, &normals, neighborhood, Some(&[3, 600]), &never()).unwrap_err();
+    assert_eq!(error.to_string(), "keypoints[1] is 600; points has rows 0 to 599");
+}
+
+// -------------------------------------------------------------------------------------------------------- all
+
+#[test]
+fn any_number_of_threads_gives_the_same_bits() {
+    let (points, normals) = ball(3000, 8);
+    let neighborhood = Neighborhood { radius: 0.2, max_neighbors: 30 };
+    let run = |threads| {
+        Pool::new(Some(threads)).unwrap().install(|| {
+            let estimated = estimate_normals(&points, neighborhood, None, &never()).unwrap();
+            let described = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+            (estimated, described)
+        })
+    };
+    assert!(run(1) == run(2) && run(2) == run(3));
+}
+
+#[test]
+fn who_cancels_gets_no_answer() {
+    let (points, normals) = ball(100, 1);
+    let cancel = never();
+    cancel.cancel();
+    let neighborhood = Neighborhood { radius: 0.4, max_neighbors: 30 };
+    let cancelled = Some(FeatureError::Cancelled);
+    assert_eq!(estimate_normals(&points, neighborhood, None, &cancel).err(), cancelled);
+    assert_eq!(fpfh(&points, &normals, neighborhood, None, &cancel).err(), cancelled);
+}
+
+// Coordinates that a map gives, and one stray point far away.
+#[test]
+fn clouds_far_off_lose_nothing() {
+    let (mut points, mut normals) = ball(400, 5);
+    let neighborhood = Neighborhood { radius: 0.3, max_neighbors: 60 };
+    let here = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+    let offset = Isometry3::translation(3e5, -5e6, 1e3);
+    for p in &mut points {
+        *p = offset * *p;
+    }
+    points.push(Point3::new(-1e9, 0.0, 1e9));
+    normals.push(Vector3::z());
+    let there = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
+    assert!(flips(&there[..400], &here) <= 40);
+    assert_eq!(there[400], [0.0; FPFH_DIM]);
+}
