@@ -11,7 +11,9 @@ use std::time::Duration;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use ibi_core::CancelToken;
-use ibi_core::features::{Neighborhood, estimate_normals, fpfh, voxel_downsample};
+use ibi_core::features::{
+    Descriptors, FPFH_DIM, Matching, Neighborhood, estimate_normals, fpfh, match_features, voxel_downsample,
+};
 use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_testkit::Rng;
 
@@ -64,6 +66,17 @@ fn features(c: &mut Criterion) {
     group.bench_function(format!("fpfh/{POINTS}"), |b| {
         b.iter(|| fpfh(black_box(&points), &normals, around, None, &never));
     });
+    for sources in [2000, 5000] {
+        let (model, model_normals) = cloud(sources);
+        let wide = Neighborhood { radius: 0.15, max_neighbors: 150 };
+        let model = fpfh(&model, &model_normals, wide, None, &never).unwrap();
+        let [model, scene] = [&model, &described].map(|rows| rows.as_flattened());
+        let rows = |values| Descriptors { values, dim: FPFH_DIM };
+        let join =
+            || match_features(rows(model), rows(scene), Matching { k: 2, ..Matching::default() }, &never);
+        assert_eq!(join().unwrap().rows.len(), 2 * POINTS);
+        group.bench_function(format!("match/{sources}x{POINTS}"), |b| b.iter(join));
+    }
     group.finish();
 }
 

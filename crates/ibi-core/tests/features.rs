@@ -7,7 +7,10 @@
 )]
 
 use ibi_core::CancelToken;
-use ibi_core::features::{FPFH_DIM, FeatureError, Neighborhood, estimate_normals, fpfh, voxel_downsample};
+use ibi_core::features::{
+    Descriptors, FPFH_DIM, FeatureError, Matches, Matching, Neighborhood, estimate_normals, fpfh,
+    match_features, voxel_downsample,
+};
 use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_testkit::strategies::{permutations, points, rigid_motions};
@@ -161,6 +164,46 @@ fn fpfh_of_key_points_is_that_of_their_rows() {
     assert_eq!(error.to_string(), "keypoints[1] is 600; points has rows 0 to 599");
 }
 
+// --------------------------------------------------------------------------------------------------- matching
+
+fn joined(source: &[Vec<f32>], target: &[Vec<f32>], dim: usize, matching: Matching) -> Matches {
+    let (source, target): (Vec<f32>, Vec<f32>) = (source.concat(), target.concat());
+    let rows = |values| Descriptors { values, dim };
+    match_features(rows(&source), rows(&target), matching, &never()).unwrap()
+}
+
+/// Rows of numbers on a coarse lattice, so that many are equally far, or of any numbers.
+fn descriptors(dim: usize, most: usize) -> impl Strategy<Value = Vec<Vec<f32>>> {
+    let number = prop_oneof![(-3..4_i8).prop_map(f32::from), -3.0..3.0_f32];
+    prop::collection::vec(prop::collection::vec(number, dim), 0..most)
+}
+
+proptest! {
+    #[test]
+    fn matches_are_their_twin(
+        (dim, source, target) in (1..40_usize).prop_flat_map(|d| (Just(d), descriptors(d, 90), descriptors(d, 40))),
+        k in 1..4_usize, mutual: bool, max_ratio in prop::option::of(0.3..=1.0),
+    ) {
+        let found = joined(&source, &target, dim, Matching { k, mutual, max_ratio });
+        let back = naive::nearest_rows(&target, &source, k);
+        let mut expected = Vec::new();
+        for (t, near) in naive::nearest_rows(&source, &target, k).iter().enumerate() {
+            let left_out = near.get(k).map_or(f64::INFINITY, |hit| hit.1);
+            for &(s, distance) in near.iter().take(k) {
+                let ratio = if left_out > 0.0 { distance / left_out } else { 1.0 };
+                let is_mutual = !mutual || back[s].iter().take(k).any(|hit| hit.0 == t);
+                if is_mutual && max_ratio.is_none_or(|most| ratio <= most) {
+                    expected.push(([s as u32, t as u32], 1.0 - ratio));
+                }
+            }
+        }
+        prop_assert_eq!(&found.rows, &expected.iter().map(|pair| pair.0).collect::<Vec<_>>());
+        for (a, b) in found.similarity.iter().zip(&expected) {
+            prop_assert!((a - b.1).abs() < 1e-12);
+        }
+    }
+}
+
 // -------------------------------------------------------------------------------------------------------- all
 
 #[test]
@@ -171,7 +214,10 @@ fn any_number_of_threads_gives_the_same_bits() {
         Pool::new(Some(threads)).unwrap().install(|| {
             let estimated = estimate_normals(&points, neighborhood, None, &never()).unwrap();
             let described = fpfh(&points, &normals, neighborhood, None, &never()).unwrap();
-            (estimated, described)
+            let rows = |values| Descriptors { values, dim: FPFH_DIM };
+            let (some, all) = (described[..500].as_flattened(), described.as_flattened());
+            let matching = Matching { k: 3, mutual: true, max_ratio: None };
+            (estimated, match_features(rows(some), rows(all), matching, &never()).unwrap(), described)
         })
     };
     assert!(run(1) == run(2) && run(2) == run(3));
@@ -186,6 +232,8 @@ fn who_cancels_gets_no_answer() {
     let cancelled = Some(FeatureError::Cancelled);
     assert_eq!(estimate_normals(&points, neighborhood, None, &cancel).err(), cancelled);
     assert_eq!(fpfh(&points, &normals, neighborhood, None, &cancel).err(), cancelled);
+    let rows = Descriptors { values: &[1.0, 2.0], dim: 1 };
+    assert_eq!(match_features(rows, rows, Matching::default(), &cancel).err(), cancelled);
 }
 
 // Coordinates that a map gives, and one stray point far away.

@@ -5,9 +5,9 @@
 //!
 //! | side | steps |
 //! |---|---|
-//! | model | [`voxel_downsample`] |
-//! | scene | [`voxel_downsample`], [`estimate_normals`] |
-//! | both | [`fpfh`], then matching |
+//! | model | [`sample_mesh`], [`outer_surface`], [`voxel_downsample`] |
+//! | scene | [`voxel_downsample`], [`estimate_normals`], [`dominant_plane`] taken away |
+//! | both | [`fpfh`], then [`match_features`] |
 //!
 //! In this crate and not in one beside it, because it lives on the private parts of the kernels: the grid, the vector
 //! units, and the discipline of threads. Functions of arrays, each by itself; they run on the [`Pool`] that they are
@@ -19,6 +19,8 @@ mod around;
 mod door;
 mod error;
 mod fpfh;
+mod leaves;
+mod matching;
 mod normals;
 mod pairs;
 mod voxel;
@@ -26,5 +28,6 @@ mod voxel;
 pub use around::Neighborhood;
 pub use error::FeatureError;
 pub use fpfh::{FPFH_DIM, fpfh};
+pub use matching::{Descriptors, Matches, Matching, match_features};
 pub use normals::estimate_normals;
 pub use voxel::{Thinned, voxel_downsample};
