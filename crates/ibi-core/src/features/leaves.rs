@@ -102,41 +102,51 @@ impl<'a> Leaves<'a> {
         sorted.clear();
         sorted.extend(self.axes.iter().map(|&axis| query[axis as usize]));
         bounds.resize(self.radii.len(), 0.0);
-        let (mut first, mut nearest) = (0, f32::INFINITY);
-        for (block, bounds) in bounds.chunks_exact_mut(LANES).enumerate() {
-            let middles = &self.middles[block * dim..(block + 1) * dim];
-            let to_middle = distances(sorted, middles, f32::INFINITY).unwrap_or([f32::INFINITY; LANES]);
-            let radii = &self.radii[block * LANES..(block + 1) * LANES];
+        // Lane by lane, as one after the other each would wait for the one before.
+        let (mut first, mut nearest) = ([0; LANES], [f32::INFINITY; LANES]);
+        for (block, bounds) in (0_u32..).zip(bounds.chunks_exact_mut(LANES)) {
+            let at = block as usize;
+            let to_middle = distances(sorted, &self.middles[at * dim..(at + 1) * dim]);
+            let radii = &self.radii[at * LANES..(at + 1) * LANES];
             for k in 0..LANES {
                 // No row of the leaf is nearer, whatever was rounded.
                 let gap = (to_middle[k].sqrt() * (1.0 - self.rounding) - radii[k]).max(0.0);
                 bounds[k] = gap * gap * (1.0 - self.rounding);
-            }
-            for (k, &dist_sq) in to_middle.iter().enumerate() {
-                (first, nearest) =
-                    if dist_sq < nearest { (block * LANES + k, dist_sq) } else { (first, nearest) };
+                let is_nearer = to_middle[k] < nearest[k];
+                nearest[k] = if is_nearer { to_middle[k] } else { nearest[k] };
+                first[k] = if is_nearer { block } else { first[k] };
             }
         }
-        if self.order.is_empty() {
-            return;
-        }
-        self.look(query, sorted, first, want, hits);
         let leaves = self.order.len().div_ceil(LANES);
+        let lane = (1..LANES).fold(0, |best, k| if nearest[k] < nearest[best] { k } else { best });
+        let first = first[lane] as usize * LANES + lane;
+        if first < leaves {
+            self.look(query, sorted, first, want, hits);
+        }
+        let mut limit = self.limit(hits, want);
         for (leaf, &bound) in bounds[..leaves].iter().enumerate() {
-            if leaf != first && f64::from(bound) <= worst(hits, want) {
+            if bound <= limit && leaf != first {
                 self.look(query, sorted, leaf, want, hits);
+                limit = self.limit(hits, want);
             }
         }
+    }
+
+    /// A squared distance in `f32` beyond this is of no interest, whatever was rounded.
+    #[inline(always)]
+    #[allow(clippy::inline_always)]
+    fn limit(&self, hits: &[Hit], want: usize) -> f32 {
+        let worst = if hits.len() < want { f64::INFINITY } else { hits[want - 1].0 };
+        worst as f32 * (1.0 + 2.0 * self.rounding)
     }
 
     #[inline(always)]
     #[allow(clippy::inline_always)]
     fn look(&self, query: &[f32], sorted: &[f32], leaf: usize, want: usize, hits: &mut Vec<Hit>) {
         let dim = self.rows.dim;
-        let limit = worst(hits, want) as f32 * (1.0 + 2.0 * self.rounding);
-        let Some(near) = distances(sorted, &self.columns[leaf * dim..(leaf + 1) * dim], limit) else {
-            return;
-        };
+        let limit = self.limit(hits, want);
+        let block = &self.columns[leaf * dim..(leaf + 1) * dim];
+        let Some(near) = distances_within(sorted, block, limit) else { return };
         let rows = &self.order[leaf * LANES..self.order.len().min((leaf + 1) * LANES)];
         for (&row, &about) in rows.iter().zip(&near) {
             if about <= limit {
@@ -144,13 +154,6 @@ impl<'a> Leaves<'a> {
             }
         }
     }
-}
-
-/// What is farther than this is of no interest.
-#[inline(always)]
-#[allow(clippy::inline_always)]
-fn worst(hits: &[Hit], want: usize) -> f64 {
-    if hits.len() < want { f64::INFINITY } else { hits[want - 1].0 }
 }
 
 #[inline(never)] // rare
@@ -162,21 +165,35 @@ fn insert(hit: Hit, want: usize, hits: &mut Vec<Hit>) {
     }
 }
 
-/// Squared distances from a row to sixteen columns; `None` if all are seen to be above the limit.
+/// Squared distances from a row to sixteen columns.
+#[inline(always)]
+#[allow(clippy::inline_always)]
+fn distances(query: &[f32], block: &[[f32; LANES]]) -> [f32; LANES] {
+    let mut sums = [0.0; LANES];
+    for (&x, column) in query.iter().zip(block) {
+        for k in 0..LANES {
+            let d = x - column[k];
+            sums[k] += d * d;
+        }
+    }
+    sums
+}
+
+/// The same; `None` as soon as all are seen to be above the limit.
 #[inline(always)]
 #[allow(clippy::inline_always, clippy::needless_bitwise_bool)] // without branches
-fn distances(query: &[f32], block: &[[f32; LANES]], limit: f32) -> Option<[f32; LANES]> {
+fn distances_within(query: &[f32], block: &[[f32; LANES]], limit: f32) -> Option<[f32; LANES]> {
     /// Dimensions between two looks at the sums.
     const STRIDE: usize = 8;
     let mut sums = [0.0; LANES];
     for (query, block) in query.chunks(STRIDE).zip(block.chunks(STRIDE)) {
-        for (&x, column) in query.iter().zip(block) {
-            for k in 0..LANES {
-                let d = x - column[k];
-                sums[k] += d * d;
-            }
+        let part = distances(query, block);
+        let mut is_any_near = false;
+        for k in 0..LANES {
+            sums[k] += part[k];
+            is_any_near |= sums[k] <= limit;
         }
-        if !sums.iter().fold(false, |near, &sum| near | (sum <= limit)) {
+        if !is_any_near {
             return None;
         }
     }
