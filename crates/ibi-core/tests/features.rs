@@ -8,8 +8,8 @@
 
 use ibi_core::CancelToken;
 use ibi_core::features::{
-    Descriptors, FPFH_DIM, FeatureError, Matches, Matching, Neighborhood, estimate_normals, fpfh,
-    match_features, voxel_downsample,
+    Amount, Descriptors, FPFH_DIM, FeatureError, Matches, Matching, Mesh, Neighborhood, PlaneSearch, Views,
+    dominant_plane, estimate_normals, fpfh, match_features, outer_surface, sample_mesh, voxel_downsample,
 };
 use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
@@ -204,6 +204,61 @@ proptest! {
     }
 }
 
+// ---------------------------------------------------------------------------------------------- planes, meshes
+
+const TRIANGLE: [Point3<f64>; 3] =
+    [Point3::new(0.0, 0.0, 0.0), Point3::new(3.0, 0.0, 0.0), Point3::new(0.0, 2.0, 0.0)];
+
+proptest! {
+    #[test]
+    fn a_plane_is_where_it_was_put(pose in rigid_motions(1e3), seed in 0..100_u64) {
+        let mut rng = Rng::new(seed);
+        let on = |rng: &mut Rng| rng.in_box(1.0).component_mul(&Vector3::new(1.0, 1.0, 0.001));
+        let mut points: Vec<Point3<f64>> = (0..400).map(|_| pose * Point3::from(on(&mut rng))).collect();
+        let above = Vector3::new(0.0, 0.0, 1.3);
+        points.extend((0..300).map(|_| pose * Point3::from(rng.in_box(1.0) + above)));
+        let search = PlaneSearch { distance: 0.01, min_share: 0.3, seed };
+        let plane = dominant_plane(&points, &search, None, &never()).unwrap().unwrap();
+        prop_assert!(plane.normal.dot(&(pose * Vector3::z())) > 0.99999);
+        prop_assert!((plane.offset - plane.normal.dot(&pose.translation.vector)).abs() < 1e-3);
+        prop_assert!(plane.inliers.iter().enumerate().all(|(row, &near)| near == (row < 400)));
+        let below = Some(pose * Point3::new(0.0, 0.0, -5.0));
+        let turned = dominant_plane(&points, &search, below, &never()).unwrap().unwrap();
+        prop_assert_eq!(turned.normal, -plane.normal);
+        let strict = PlaneSearch { min_share: 0.6, ..search };
+        prop_assert_eq!(dominant_plane(&points, &strict, None, &never()).unwrap(), None);
+    }
+
+    // No two of a side are too near, and none has left the face.
+    #[test]
+    fn samples_keep_their_distance(count in 1..300_usize, seed: u64) {
+        let mesh = Mesh { vertices: &TRIANGLE, faces: &[[0, 1, 2]] };
+        let sampled = sample_mesh(&mesh, Amount::Count(count), seed, &never()).unwrap();
+        prop_assert_eq!(sampled.points.len(), count);
+        prop_assert!(sampled.normals.iter().all(|n| *n == Vector3::z()));
+        // Half the distance that a lattice would have.
+        let least = 0.5 * (3.0 / (count as f64 * 0.75_f64.sqrt())).sqrt();
+        for (i, p) in sampled.points.iter().enumerate() {
+            prop_assert!(p.z == 0.0 && p.x >= 0.0 && p.y >= 0.0 && p.x / 3.0 + p.y / 2.0 < 1.0 + 1e-12);
+            prop_assert!(sampled.points[..i].iter().all(|q| (p - q).norm() > least || count < 10));
+        }
+        let spaced = sample_mesh(&mesh, Amount::Spacing(0.2), seed, &never()).unwrap();
+        for (i, p) in spaced.points.iter().enumerate() {
+            prop_assert!(spaced.points[..i].iter().all(|q| (p - q).norm() >= 0.2));
+        }
+    }
+}
+
+#[test]
+fn a_face_without_its_corner_is_refused() {
+    let mesh = Mesh { vertices: &TRIANGLE, faces: &[[0, 1, 2], [0, 3, 1]] };
+    let error = sample_mesh(&mesh, Amount::Count(9), 0, &never()).unwrap_err();
+    assert_eq!(error.to_string(), "faces[1, 1] is 3; vertices has rows 0 to 2");
+    let flat = Mesh { vertices: &TRIANGLE, faces: &[[0, 1, 1]] };
+    let error = sample_mesh(&flat, Amount::Spacing(1.0), 0, &never()).unwrap_err();
+    assert_eq!(error, FeatureError::NoArea);
+}
+
 // -------------------------------------------------------------------------------------------------------- all
 
 #[test]
@@ -217,7 +272,18 @@ fn any_number_of_threads_gives_the_same_bits() {
             let rows = |values| Descriptors { values, dim: FPFH_DIM };
             let (some, all) = (described[..500].as_flattened(), described.as_flattened());
             let matching = Matching { k: 3, mutual: true, max_ratio: None };
-            (estimated, match_features(rows(some), rows(all), matching, &never()).unwrap(), described)
+            let mesh = Mesh { vertices: &points, faces: &[[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]] };
+            let outer = outer_surface(&points, &normals, &mesh, &Views::default(), &never()).unwrap();
+            let search = PlaneSearch { distance: 0.1, min_share: 0.05, seed: 0 };
+            let plane = dominant_plane(&points, &search, None, &never()).unwrap();
+            assert!(plane.is_some());
+            (
+                outer,
+                plane,
+                estimated,
+                match_features(rows(some), rows(all), matching, &never()).unwrap(),
+                described,
+            )
         })
     };
     assert!(run(1) == run(2) && run(2) == run(3));
@@ -234,6 +300,11 @@ fn who_cancels_gets_no_answer() {
     assert_eq!(fpfh(&points, &normals, neighborhood, None, &cancel).err(), cancelled);
     let rows = Descriptors { values: &[1.0, 2.0], dim: 1 };
     assert_eq!(match_features(rows, rows, Matching::default(), &cancel).err(), cancelled);
+    let mesh = Mesh { vertices: &TRIANGLE, faces: &[[0, 1, 2]] };
+    assert_eq!(sample_mesh(&mesh, Amount::Count(9), 0, &cancel).err(), cancelled);
+    assert_eq!(outer_surface(&points, &normals, &mesh, &Views::default(), &cancel).err(), cancelled);
+    let search = PlaneSearch { distance: 0.1, min_share: 0.2, seed: 0 };
+    assert_eq!(dominant_plane(&points, &search, None, &cancel).err(), cancelled);
 }
 
 // Coordinates that a map gives, and one stray point far away.

@@ -56,6 +56,29 @@ pub enum FeatureError {
         /// The length of that.
         len: usize,
     },
+    /// A face has a corner that is not a vertex.
+    #[error("faces[{row}, {column}] is {index}; vertices has rows 0 to {}", len.saturating_sub(1))]
+    FaceIndex {
+        /// First offending face.
+        row: usize,
+        /// Its first offending corner.
+        column: usize,
+        /// The vertex that it names.
+        index: i64,
+        /// Number of vertices.
+        len: usize,
+    },
+    /// A mesh without a surface to draw points from.
+    #[error("the faces of the mesh have no area")]
+    NoArea,
+    /// More points than fit into memory.
+    #[error("about {count} points are asked for; at most {most} are drawn")]
+    TooManySamples {
+        /// So many, or more.
+        count: usize,
+        /// What is allowed.
+        most: usize,
+    },
     /// A number of a descriptor is NaN, infinite, or so large that sums of its square are.
     #[error("{argument}[{row}, {column}] is {value}; descriptors must be finite and below 1e15")]
     Descriptor {
