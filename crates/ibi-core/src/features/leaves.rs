@@ -6,7 +6,8 @@
 
 use std::ops::Range;
 
-use super::Descriptors;
+use super::{Descriptors, FeatureError};
+use crate::interrupt::CancelToken;
 use crate::kernels::simd::simd;
 
 /// Rows of a leaf, and what is treated side by side.
@@ -37,27 +38,28 @@ pub(super) type Hit = (f64, u32);
 
 /// What a thread needs beside the leaves.
 #[derive(Default)]
-pub(super) struct Search {
+struct Search {
     /// The query in the order of the axes.
     query: Vec<f32>,
     bounds: Vec<f32>,
-    pub(super) hits: Vec<Hit>,
+    hits: Vec<Hit>,
 }
 
 impl<'a> Leaves<'a> {
-    pub(super) fn new(rows: Descriptors<'a>) -> Self {
+    /// Large tables take seconds, hence the token.
+    pub(super) fn new(rows: Descriptors<'a>, cancel: &CancelToken) -> Result<Self, FeatureError> {
         let dim = rows.dim;
         let mut order: Vec<u32> = (0..rows.len() as u32).collect();
         let variances = variances(&rows, &order);
         let mut axes: Vec<u32> = (0..dim as u32).collect();
         axes.sort_by(|&a, &b| variances[b as usize].total_cmp(&variances[a as usize]));
-        split(&rows, &mut order);
-        let axis = |d: usize| axes[d] as usize;
-        let column = |at: usize, d: usize| order.get(at).map_or(f32::INFINITY, |&row| rows.row(row)[axis(d)]);
+        split(&rows, &mut order, cancel);
         let count = order.len().div_ceil(LANES);
-        let columns = blocks(count, dim, column);
         let (mut centres, mut radii) = (Vec::new(), Vec::new());
         for leaf in order.chunks(LANES) {
+            if cancel.is_cancelled() {
+                return Err(FeatureError::Cancelled);
+            }
             let mean = |d: usize| leaf.iter().map(|&row| f64::from(rows.row(row)[d])).sum::<f64>();
             let centre: Vec<f32> = (0..dim).map(|d| (mean(d) / leaf.len() as f64) as f32).collect();
             let farthest = leaf.iter().map(|&row| dist_sq(rows.row(row), &centre)).fold(0.0, f64::max);
@@ -65,28 +67,34 @@ impl<'a> Leaves<'a> {
             radii.push((farthest.sqrt() * (1.0 + 1e-6)) as f32);
             centres.push(centre);
         }
-        let centre = |at: usize, d: usize| centres.get(at).map_or(f32::INFINITY, |centre| centre[axis(d)]);
-        let middles = blocks(count.div_ceil(LANES), dim, centre);
+        let columns = blocks(count, &axes, |at| order.get(at).map(|&row| rows.row(row)));
+        let middles = blocks(count.div_ceil(LANES), &axes, |at| centres.get(at).map(Vec::as_slice));
         radii.resize(count.next_multiple_of(LANES), 0.0);
         // A difference, its square and each of `dim` sums are rounded once.
         let rounding = 2.0 * (dim as f32 + 4.0) * 0.5 * f32::EPSILON;
-        Self { rows, axes, order, columns, middles, radii, rounding }
+        Ok(Self { rows, axes, order, columns, middles, radii, rounding })
     }
 
-    /// Tells `found` for each of the `queries` the `want` nearest rows, or all if there are no more.
+    /// Tells `found` for each of the `queries` the `want` nearest rows, or all if there are no more; of those before the
+    /// call was cancelled.
     pub(super) fn nearest(
         &self,
         queries: &Descriptors<'_>,
         run: Range<usize>,
         want: usize,
-        search: &mut Search,
+        cancel: &CancelToken,
         mut found: impl FnMut(usize, &[Hit]),
     ) {
+        let mut search = Search::default();
         simd(
             #[inline(always)]
             || {
                 for query in run {
-                    self.query(queries.row(query as u32), want, search);
+                    // One may take a millisecond.
+                    if cancel.is_cancelled() {
+                        return;
+                    }
+                    self.query(queries.row(query as u32), want, &mut search);
                     found(query, &search.hits);
                 }
             },
@@ -205,14 +213,23 @@ fn dist_sq(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum()
 }
 
-fn blocks(count: usize, dim: usize, column: impl Fn(usize, usize) -> f32) -> Block {
-    let lane = |block: usize, d: usize| std::array::from_fn(|k| column(block * LANES + k, d));
-    (0..count).flat_map(|block| (0..dim).map(move |d| (block, d))).map(|(block, d)| lane(block, d)).collect()
+/// Rows as columns, with the axes in their order; infinity where there is no row.
+fn blocks<'r>(count: usize, axes: &[u32], row: impl Fn(usize) -> Option<&'r [f32]>) -> Block {
+    let mut columns = vec![[f32::INFINITY; LANES]; count * axes.len()];
+    for (block, columns) in columns.chunks_exact_mut(axes.len()).enumerate() {
+        for lane in 0..LANES {
+            let Some(row) = row(block * LANES + lane) else { break };
+            for (column, &axis) in columns.iter_mut().zip(axes) {
+                column[lane] = row[axis as usize];
+            }
+        }
+    }
+    columns
 }
 
 /// Sorts rows so that each `LANES` of them are alike: halves them by the dimension of most spread, and again.
-fn split(rows: &Descriptors<'_>, order: &mut [u32]) {
-    if order.len() <= LANES {
+fn split(rows: &Descriptors<'_>, order: &mut [u32], cancel: &CancelToken) {
+    if order.len() <= LANES || cancel.is_cancelled() {
         return;
     }
     let axis = widest(rows, order);
@@ -221,8 +238,8 @@ fn split(rows: &Descriptors<'_>, order: &mut [u32]) {
     let value = |row: u32| rows.row(row)[axis];
     order.select_nth_unstable_by(half, |&a, &b| value(a).total_cmp(&value(b)).then(a.cmp(&b)));
     let (low, high) = order.split_at_mut(half);
-    split(rows, low);
-    split(rows, high);
+    split(rows, low, cancel);
+    split(rows, high, cancel);
 }
 
 /// The dimension of the largest variance.

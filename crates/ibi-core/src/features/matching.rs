@@ -2,7 +2,7 @@
 
 use super::FeatureError;
 use super::door::check_len;
-use super::leaves::{Leaves, Search};
+use super::leaves::Leaves;
 use crate::interrupt::CancelToken;
 use crate::kernels::par;
 
@@ -105,13 +105,10 @@ pub fn match_features(
         return Err(FeatureError::Setting { argument: "ratio", value, allowed: "above 0 and at most 1" });
     }
     let back = if mutual { Some(nearest_rows(target, source, k, cancel)?) } else { None };
-    let leaves = Leaves::new(source);
+    let leaves = Leaves::new(source, cancel)?;
     let parts = par::chunks(target.len(), GRAIN, |run| {
         let mut part = Matches::default();
-        if cancel.is_cancelled() {
-            return part;
-        }
-        leaves.nearest(&target, run, k + 1, &mut Search::default(), |row, hits| {
+        leaves.nearest(&target, run, k + 1, cancel, |row, hits| {
             let row = row as u32;
             let left_out = hits.get(k).map_or(f64::INFINITY, |hit| hit.0.sqrt());
             for &(dist_sq, other) in hits.iter().take(k) {
@@ -148,14 +145,12 @@ fn nearest_rows(
     k: usize,
     cancel: &CancelToken,
 ) -> Result<Vec<Vec<u32>>, FeatureError> {
-    let leaves = Leaves::new(rows);
+    let leaves = Leaves::new(rows, cancel)?;
     let parts = par::chunks(queries.len(), GRAIN, |run| {
         let mut part = Vec::new();
-        if !cancel.is_cancelled() {
-            leaves.nearest(&queries, run, k, &mut Search::default(), |_, hits| {
-                part.push(hits.iter().map(|hit| hit.1).collect());
-            });
-        }
+        leaves.nearest(&queries, run, k, cancel, |_, hits| {
+            part.push(hits.iter().map(|hit| hit.1).collect());
+        });
         part
     });
     if cancel.is_cancelled() {
