@@ -265,8 +265,10 @@ def test_the_table_is_found_and_taken_away(offset):
     assert plane.inliers[~of_table].mean() < 0.05
     distance = np.abs(points @ plane.normal - plane.offset)
     np.testing.assert_array_equal(plane.inliers, distance <= 0.01)
+    assert plane.behind == 0
     below = features.dominant_plane(points, 0.01, viewpoint=place - 5 * normal)
     np.testing.assert_array_equal(below.normal, -plane.normal)
+    assert below.behind == pytest.approx((~plane.inliers).mean())
     assert below.offset == pytest.approx(-plane.offset)
 
 
@@ -406,6 +408,9 @@ def test_a_mesh_and_a_scan_suffice():
     mesh = read_ply(TEE / "model_tee_mesh.ply")
     points, normals = features.sample_mesh(*mesh, spacing=voxel / 2)
     seen = features.outer_surface(points, normals, *mesh)
+    # There is no table in this scan, and the faces that share a plane are not taken for one.
+    plane = features.dominant_plane(tgt, 1.5 * voxel, viewpoint=[0, 0, 0])
+    assert plane is None or plane.behind > 0.02
     src, src_normals = features.voxel_downsample(points[seen], voxel, normals=normals[seen])
     tgt_normals = features.estimate_normals(tgt, 3 * voxel, viewpoint=[0, 0, 0])
     corr, similarity = ibi.match(

@@ -221,11 +221,15 @@ class Plane:
         The points x of the plane have n . x = offset; data units.
     inliers : (N,) bool
         Which points lie within the distance that was asked for.
+    behind : float
+        Share of all points that lie behind the plane, farther than that distance. A table hides what is
+        behind it: a plane with more than a few stray points there is a face of the parts.
     """
 
     normal: npt.NDArray[np.float64]
     offset: float
     inliers: npt.NDArray[np.bool_]
+    behind: float
 
 
 def dominant_plane(
@@ -239,8 +243,9 @@ def dominant_plane(
 ) -> Plane | None:
     """Find the plane that holds the most points: the table that parts lie on, or the floor of a bin.
 
-    Drawn through three points at random, again and again, and fitted by least squares to what lies near it.
-    What is left of a scan without it: ``points[~plane.inliers]``.
+    Drawn through three points at random, again and again, and fitted by least squares to what lies near
+    it. What is left of a scan without it: ``points[~plane.inliers]``. Look at ``plane.behind`` first:
+    where the scan shows no table, the faces of parts that lie side by side are the largest plane.
 
     Parameters
     ----------
@@ -294,8 +299,8 @@ def dominant_plane(
     )
     if found is None:
         return None
-    normal, offset, inliers = found
-    return Plane(np.array(normal), offset, inliers)
+    normal, offset, inliers, behind = found
+    return Plane(np.array(normal), offset, inliers, behind)
 
 
 def sample_mesh(

@@ -124,8 +124,8 @@ fn features_match<'py>(
     Ok((rows.into_pyarray(py).reshape([count, 2])?, matches.similarity.into_pyarray(py)))
 }
 
-/// The normal, the offset and which points are near.
-type Plane<'py> = ([f64; 3], f64, Bound<'py, PyArray1<bool>>);
+/// The normal, the offset, which points are near, and the share of those behind.
+type Plane<'py> = ([f64; 3], f64, Bound<'py, PyArray1<bool>>, f64);
 
 #[pyfunction]
 fn features_dominant_plane<'py>(
@@ -142,7 +142,7 @@ fn features_dominant_plane<'py>(
     let viewpoint = viewpoint.map(Point3::from);
     let plane =
         in_pool(py, num_threads, |cancel| features::dominant_plane(&points, &search, viewpoint, cancel))?;
-    Ok(plane.map(|plane| (plane.normal.into(), plane.offset, plane.inliers.into_pyarray(py))))
+    Ok(plane.map(|p| (p.normal.into(), p.offset, p.inliers.into_pyarray(py), p.behind)))
 }
 
 #[pyfunction]

@@ -31,6 +31,9 @@ pub struct Plane {
     pub offset: f64,
     /// Which points lie within the distance of it.
     pub inliers: Vec<bool>,
+    /// Share of all points that lie behind the plane, farther than the distance. A table hides what is behind it: a plane
+    /// with more than a few stray points there is a face of the parts.
+    pub behind: f64,
 }
 
 /// How many points stand for all while planes are drawn.
@@ -83,7 +86,9 @@ pub fn dominant_plane(
     }
     let turn = if faces(&plane, points, &inliers, viewpoint) { 1.0 } else { -1.0 };
     let normal = turn * plane.normal;
-    Ok(Some(Plane { normal, offset: normal.dot(&plane.through.coords), inliers }))
+    let behind = points.iter().filter(|p| turn * plane.distance(p) < -search.distance).count();
+    let (offset, behind) = (normal.dot(&plane.through.coords), behind as f64 / points.len() as f64);
+    Ok(Some(Plane { normal, offset, inliers, behind }))
 }
 
 /// Through a point and not at an offset, which would lose digits far from the origin.
