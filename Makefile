@@ -56,6 +56,10 @@ bench-peers: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## compare with PCL, O
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py
 
+.PHONY: bench-features
+bench-features: $(STAMPS)/package $(STAMPS)/open3d ## time the built-in features against Open3D, write the record (needs Open3D)
+	$(BIN)/python benchmarks/features.py
+
 .PHONY: lint
 lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs
 	cargo fmt --all --check

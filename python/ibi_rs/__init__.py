@@ -3,8 +3,9 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import metrics, plot, synth
+from ibi_rs import features, metrics, plot, synth
 from ibi_rs._core import InputError, ParamsError, __version__
+from ibi_rs._match import match
 from ibi_rs._register import Model, register
 from ibi_rs.params import (
     Evidence,
@@ -53,6 +54,8 @@ __all__ = [
     "Verdict",
     "Voting",
     "__version__",
+    "features",
+    "match",
     "metrics",
     "plot",
     "register",

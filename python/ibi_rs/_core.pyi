@@ -12,6 +12,13 @@ __all__ = [
     "Source",
     "__version__",
     "check_params",
+    "features_dominant_plane",
+    "features_estimate_normals",
+    "features_fpfh",
+    "features_match",
+    "features_outer_surface",
+    "features_sample_mesh",
+    "features_voxel_downsample",
     "metrics_add",
     "metrics_add_s",
     "metrics_assignment",
@@ -80,6 +87,56 @@ def register(
     Then of the run: labels (M,) int32, resolution and stop_message; and as JSON text rounds, stop_reason and
     timings.
     """
+
+# Features.
+
+def features_voxel_downsample(
+    points: _Floats, normals: _Floats | None, voxel: float
+) -> tuple[_Floats, _Floats | None]: ...
+def features_estimate_normals(
+    points: _Floats,
+    radius: float,
+    max_neighbors: int,
+    viewpoint: Sequence[float] | None,
+    num_threads: int | None,
+) -> _Floats: ...
+def features_fpfh(
+    points: _Floats,
+    normals: _Floats,
+    radius: float,
+    max_neighbors: int,
+    keypoints: _Ints | None,
+    num_threads: int | None,
+) -> npt.NDArray[np.float32]: ...
+def features_match(
+    src_feat: npt.NDArray[np.float32],
+    tgt_feat: npt.NDArray[np.float32],
+    k: int,
+    mutual: bool,
+    ratio: float | None,
+    num_threads: int | None,
+) -> tuple[_Ints, _Floats]: ...
+def features_dominant_plane(
+    points: _Floats,
+    distance: float,
+    min_share: float,
+    viewpoint: Sequence[float] | None,
+    seed: int,
+    num_threads: int | None,
+) -> tuple[list[float], float, npt.NDArray[np.bool_], float] | None: ...
+def features_sample_mesh(
+    vertices: _Floats, faces: _Ints, count: int | None, spacing: float, seed: int
+) -> tuple[_Floats, _Floats]: ...
+def features_outer_surface(
+    points: _Floats,
+    normals: _Floats,
+    vertices: _Floats,
+    faces: _Ints,
+    num_views: int,
+    max_angle_rad: float,
+    lift: float | None,
+    num_threads: int | None,
+) -> npt.NDArray[np.bool_]: ...
 
 # Metrics.
 

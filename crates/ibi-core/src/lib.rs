@@ -14,6 +14,8 @@
 //! Then correspondences are removed and the next round begins, until the seeds run dry. [`Registrar`] is the
 //! loop; each stage is a trait in [`stages`] and an enum of named variants in [`Params`].
 //!
+//! Where correspondences are not given, [`features`] makes them from a mesh and a scan.
+//!
 //! All lengths in [`Params`] are multiples of the resolution `pr`, so the unit of the data does not matter.
 //! The same input and seed give the same bits, for any number of threads.
 //!
@@ -23,6 +25,7 @@
 mod claims;
 mod correspondence;
 mod error;
+pub mod features;
 mod interrupt;
 mod joint;
 pub mod kernels;

@@ -1,5 +1,6 @@
 //! The module `ibi_rs._core`: converts, detaches, maps errors. Everything a user reads is in `python/ibi_rs`.
 
+mod features;
 mod metrics;
 mod params;
 mod register;
@@ -33,5 +34,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("ParamsError", m.py().get_type::<ParamsError>())?;
     params::register(m)?;
     register::register(m)?;
-    metrics::register(m)
+    metrics::register(m)?;
+    features::register(m)
 }

@@ -109,7 +109,7 @@ fn register_clouds<'py>(
 
 /// Runs `job` on a thread of its own with the GIL released, while this one, which alone may see signals, looks
 /// for Ctrl-C. A signal cancels the job and is raised once the job has ended.
-fn in_background<T: Send>(
+pub(crate) fn in_background<T: Send>(
     py: Python<'_>,
     job: impl FnOnce(CancelToken) -> PyResult<T> + Send,
 ) -> PyResult<T> {
@@ -169,7 +169,10 @@ fn with_frames<'a>(cloud: Cloud<'a>, frames: Option<&PyReadonlyArray3<'_, f64>>)
     Ok(cloud.with_frames(frames.outer_iter().map(frame).collect()))
 }
 
-fn rows3<T>(array: &PyReadonlyArray2<'_, f64>, row: impl Fn(f64, f64, f64) -> T) -> PyResult<Vec<T>> {
+pub(crate) fn rows3<T>(
+    array: &PyReadonlyArray2<'_, f64>,
+    row: impl Fn(f64, f64, f64) -> T,
+) -> PyResult<Vec<T>> {
     let array = array.as_array();
     if array.ncols() != 3 {
         return Err(InputError::new_err(format!("expected 3 columns, got {}", array.ncols())));

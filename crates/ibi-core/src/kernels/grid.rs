@@ -109,6 +109,27 @@ impl Grid {
         })
     }
 
+    /// Hands the ranges of [`Self::around`] to `look`. A loop and no iterator, where many ask for many.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // the head of an inner loop
+    pub(crate) fn each_around(&self, place: [f32; 3], radius: f32, mut look: impl FnMut(Range<usize>)) {
+        let radius = radius + 1e-4 * radius + 1e-6 * place.iter().fold(0.0, |a: f32, x| a.max(x.abs()));
+        let low = self.cell(place.map(|x| x - radius));
+        let high = self.cell(place.map(|x| x + radius));
+        for x in low[0]..=high[0] {
+            let dx = self.gap(0, x, place[0]);
+            for y in low[1]..=high[1] {
+                let dy = self.gap(1, y, place[1]);
+                let left = radius * radius - dx * dx - dy * dy;
+                if left >= 0.0 {
+                    let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
+                    let (first, last) = (self.along(2, place[2] - reach), self.along(2, place[2] + reach));
+                    look(self.starts[row + first] as usize..self.starts[row + last + 1] as usize);
+                }
+            }
+        }
+    }
+
     /// For each cell that holds points: its range of [`Self::order`], and, ascending, those that hold every point within
     /// `radius` of any of its points, and others. Cells follow each other in the order.
     pub fn neighborhoods(&self, radius: f32) -> impl Iterator<Item = (Range<usize>, Vec<Range<usize>>)> + '_ {
