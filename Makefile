@@ -40,13 +40,21 @@ test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and 
 bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac picks some
 	cargo bench -p ibi-core --bench '*' -- $(ARGS)
 
+# Two threads of BLAS that wait for each other on a busy machine took seven times as long as one.
+PAPER_TABLES := OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/paper_tables.py
+
 .PHONY: tables
-tables: $(STAMPS)/package $(STAMPS)/open3d ## print the benchmark tables, write benchmarks/records and docs/figures (needs Open3D)
+tables: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## print the benchmark tables, write benchmarks/records and docs/figures (needs Open3D)
 	$(BIN)/python benchmarks/symmetry.py examples/models
 	$(BIN)/python benchmarks/near_copies.py examples/models
 	$(BIN)/python benchmarks/accuracy.py
 	$(BIN)/python benchmarks/ablation.py
 	$(BIN)/python benchmarks/calibration.py
+	$(PAPER_TABLES) --docs
+
+.PHONY: paper-tables
+paper-tables: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## the last of these alone, the paper's tables; ARGS=--help tells more
+	$(PAPER_TABLES) $(ARGS)
 
 .PHONY: bench-peers
 bench-peers: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## compare with PCL, Open3D, KISS-Matcher, OpenCV, ECC; ARGS=--help tells more

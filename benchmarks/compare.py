@@ -34,7 +34,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from peers import METHODS, Missing
 from peers.contract import CORES
-from peers.methods import OURS
+from peers.methods import OURS, PAPER_ONLY
 from peers.settings import SETTINGS, SWEEP, settings
 
 FIGURES = Path(__file__).parents[1] / "docs/figures"
@@ -263,7 +263,7 @@ def main() -> None:
     chosen = args.layout or [*LAYOUTS_RUN, *([WITH_MODELNET] if args.modelnet else [])]
     if args.modelnet is None and any(LAYOUTS[name].shapes == "modelnet" for name in chosen):
         parser.error("ModelNet layouts need --modelnet")
-    versions, missing = check(args.method or list(METHODS))
+    versions, missing = check(args.method or [name for name in METHODS if name not in PAPER_ONLY])
     print(f"{CORES} of {os.cpu_count()} cores, {platform.machine()}, ibi_rs {ibi.__version__}")
     for name, reason in missing.items():
         print(f"missing: {name}: {reason}")

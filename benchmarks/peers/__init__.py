@@ -9,7 +9,8 @@ A peer's module has two functions:
     and gives the poses found, (K, 4, 4) target_from_source, best first. All that depends on the scene is in
     there: trees, normals, conversions, checks.
 
-`METHODS` lists what is run; `settings` holds how.
+`METHODS` lists what is run; `settings` holds how. CONSAC and PointCLM need weights, which are not here: their
+files say what the weights have to be and where their path is looked for.
 """
 
 from .contract import Method, Missing, Register

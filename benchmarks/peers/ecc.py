@@ -122,16 +122,16 @@ def _distances(points: Array) -> NDArray[np.float32]:
     return np.sqrt(total, out=total)
 
 
-def clusters(similarity: NDArray[np.float32], t_merge: float = 0.2) -> NDArray[np.int64]:
+def clusters(preference: NDArray[np.float32], t_merge: float = 0.2) -> NDArray[np.int64]:
     """Merge the two nearest clusters again and again, while they are nearer than `t_merge`.
 
-    A cluster is a column of the matrix, that of two merged is their element-wise minimum. The distance is
-    Tanimoto's, 1 - uv / (uu + vv - uv).
+    A cluster is a row of the matrix, that of two merged is their element-wise minimum. The distance is
+    Tanimoto's, 1 - uv / (uu + vv - uv), and 1 between two rows of zeros.
 
     Parameters
     ----------
-    similarity : (n, n) float32
-        Symmetric, with a positive diagonal.
+    preference : (n, m) float32
+        Not negative. For ECC the compatibility with each other, for T-Linkage the preference of hypotheses.
     t_merge : float
 
     Returns
@@ -139,12 +139,13 @@ def clusters(similarity: NDArray[np.float32], t_merge: float = 0.2) -> NDArray[n
     (n,) int64
         The cluster of each, numbered by a member.
     """
-    n = len(similarity)
-    by_row = similarity.copy()  # a cluster is a column here: its few non-zero rows are taken whole
-    by_cluster = similarity.copy()  # and a row here
-    product = similarity @ similarity.T
+    n = len(preference)
+    by_row = preference.T.copy()  # a cluster is a column here: its few non-zero rows are taken whole
+    by_cluster = preference.copy()  # and a row here
+    product = preference @ preference.T
     norm = np.diagonal(product).copy()
-    dist = 1 - product / (norm[:, None] + norm - product)
+    union = norm[:, None] + norm - product
+    dist = 1 - np.divide(product, union, out=np.zeros_like(union), where=union > 0)
     np.fill_diagonal(dist, np.inf)
     nearest = dist.argmin(axis=1)
     least = dist[np.arange(n), nearest]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ibi_rs as ibi
 from layouts import NO_NORMALS
 
-from . import ecc, kiss, open3d_ransac, opencv_ppf, ours, pcl
+from . import consac, ecc, kiss, open3d_ransac, opencv_ppf, ours, pcl, pointclm, progx, tlinkage
 from .contract import CORES, Method
 
 
@@ -30,5 +30,15 @@ METHODS = {
     "KISS-Matcher, sequence": Method(kiss, CORES),
     "OpenCV PPF + check": Method(opencv_ppf, CORES),
     "ECC": Method(ecc, CORES),
+    "T-Linkage": Method(tlinkage, CORES),
+    "Progressive-X": Method(progx, CORES),
+    "CONSAC": Method(consac, CORES),
+    "PointCLM": Method(pointclm, CORES),
 }
 """Every method by the name of its row."""
+
+PAPER_ONLY = ("T-Linkage", "Progressive-X", "CONSAC", "PointCLM")
+"""Run by paper_tables.py, beside the paper's figures; compare.py runs them only when they are named."""
+
+LEARNED = ("CONSAC", "PointCLM")
+"""Need weights and have their defaults for settings: there is nothing to choose them with."""

@@ -34,7 +34,7 @@ def prepare(
     every: int,
     neighbors: int,
     candidates: int,
-    least: float,
+    least: float | None,
 ) -> Register:
     """Point pair features; the detector is trained on the model beforehand.
 
@@ -48,9 +48,9 @@ def prepare(
     neighbors : int
         Of OpenCV's normal estimation, where the scene has no normals.
     candidates : int
-        So many poses, those with most votes, are checked.
-    least : float
-        Threshold of the overlap check.
+        So many poses, those with most votes, are taken.
+    least : float or None
+        Threshold of the overlap check; None: OpenCV's poses as they are.
 
     Returns
     -------
@@ -72,6 +72,6 @@ def prepare(
         found = detector.match(with_normals(scene.tgt, scene.tgt_normals), 1 / every, scene_step)
         found = sorted(found, key=lambda pose: -pose.numVotes)[:candidates]
         poses = np.array([pose.pose for pose in found]).reshape(-1, 4, 4)
-        return keep_best(poses, Claims(scene.src, scene.tgt, 1.5 * pr), least)
+        return poses if least is None else keep_best(poses, Claims(scene.src, scene.tgt, 1.5 * pr), least)
 
     return register

@@ -76,6 +76,16 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
         "ecc": {"samples": 1024, "inlier": 0.15, "t_merge": 0.2, "t_count": 0.5, "min_members": 10},
         "fpfh": {"samples": 1024, "inlier": 0.3, "t_merge": 0.4, "t_count": 0.5, "min_members": 10},
     },
+    "T-Linkage": {
+        "outlier": {"tau_pr": 0.3, "least": 4, "neighbors": 64},
+        "ecc": {"tau_pr": 0.2, "least": 6, "neighbors": 64},
+        "fpfh": {"tau_pr": 0.5, "least": 5, "neighbors": None},
+    },
+    "Progressive-X": {
+        "outlier": {"inlier_pr": 2.5, "least": 24, "neighbors": 32},
+        "ecc": {"inlier_pr": 1.0, "least": 32, "neighbors": 32},
+        "fpfh": {"inlier_pr": 2.5, "least": 16, "neighbors": 128},
+    },
 }  # fmt: skip
 
 SWEEP: dict[str, dict[str, list[Any]]] = {
@@ -112,6 +122,13 @@ SWEEP: dict[str, dict[str, list[Any]]] = {
     "ECC": {
         "inlier": [0.1, 0.15, 0.2, 0.3], "t_merge": [0.1, 0.2, 0.4, 0.6],
         "t_count": [0.1, 0.2, 0.3, 0.5, 0.7], "min_members": [5, 10, 20],
+    },
+    # The number of samples is ECC's.
+    "T-Linkage": {
+        "tau_pr": [0.1, 0.2, 0.3, 0.5], "least": [4, 5, 6, 8, 12], "neighbors": [16, 32, 64, None],
+    },
+    "Progressive-X": {
+        "inlier_pr": [0.5, 1.0, 1.5, 2.5], "least": [16, 24, 32], "neighbors": [32, 64, 128],
     },
 }  # fmt: skip
 
