@@ -134,12 +134,15 @@ def test_distinct_drops_the_earlier_of_two_alike():
 # T-Linkage and Progressive-X ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["T-Linkage", "Progressive-X"])
-def test_multi_model_fitting_finds_most_instances(scene, name):
-    found = METHODS[name].prepare(scene, settings(name, "outlier-10-50"))(scene)
+@pytest.mark.parametrize(
+    ("name", "change"), [("T-Linkage", {"tau_pr": 0.5, "least": 8}), ("Progressive-X", {"least": 12})]
+)
+def test_multi_model_fitting_finds_all_instances_among_few_outliers(name, change):
+    scene = synth.outlier_layout(3, outlier_ratio=0.4, num_instances=4, num_correspondences=800)
+    found = METHODS[name].prepare(scene, {**settings(name, "outlier-10-50"), **change})(scene)
     score = metrics.score_scene(found, scene.poses)
-    assert score.recall >= 0.8
-    assert score.precision >= 0.8
+    assert score.recall == 1
+    assert score.precision == 1
 
 
 @pytest.mark.parametrize("name", ["T-Linkage", "Progressive-X"])
@@ -156,9 +159,10 @@ def test_sampled_triplets_are_near_and_may_be_rigid(scene):
     sampler = triplets.Sampler(src, tgt, 20, 0.1, np.random.default_rng(0))
     rows = sampler.triplets(20_000)
     assert len(rows) > 20
-    rank = np.argsort(np.argsort(np.linalg.norm(tgt[:, None] - tgt, axis=2), axis=1), axis=1)
+    distance = np.linalg.norm(tgt[:, None] - tgt, axis=2)
+    farthest = np.sort(distance, axis=1)[:, 20]  # not by rank: target points repeat
     for i, *others in rows:
-        assert all(rank[i, j] <= 20 for j in others)
+        assert all(distance[i, j] <= farthest[i] for j in others)
         for a, b in combinations((i, *others), 2):
             of_src, of_tgt = np.linalg.norm(src[a] - src[b]), np.linalg.norm(tgt[a] - tgt[b])
             assert abs(of_src - of_tgt) <= 0.2
@@ -221,7 +225,7 @@ def test_competing_models_keep_what_is_theirs(scene):
     src, tgt = scene.src[scene.corr[:, 0]], scene.tgt[scene.corr[:, 1]]
     gamma = 2 * model_spacing(scene.src)
     rough = np.concatenate([scene.poses, scene.poses[:2]])
-    rough[:, :3, 3] += np.random.default_rng(0).normal(size=(7, 3)) * 0.03
+    rough[:, :3, 3] += np.random.default_rng(0).normal(size=(7, 3)) * gamma / 4
     fitted = progx.compete(rough, src, tgt, gamma, 12)
     label = np.where(
         ecc.residuals(fitted, src, tgt).min(axis=0) < gamma,
@@ -257,9 +261,9 @@ def test_a_network_without_weights_is_missing(peer, name, scene, monkeypatch, tm
 def test_a_network_that_knows_the_truth_finds_all(peer, scene, monkeypatch):
     label = scene.labels()
     weights = {
-        # True pairs of the first instance that is not explained yet.
+        # True pairs of the instance that is explained least.
         consac: lambda x: np.where(
-            (label >= 0) & (label == label[(label >= 0) & (x[:, 6] == 0)].min()), 0, -50
+            label == np.bincount(label[(label >= 0) & (x[:, 6] == 0)]).argmax(), 0, -50
         ),
         pointclm: lambda x: np.where(label[:, None] < 0, 0, label[:, None] == np.arange(5)),
     }
@@ -384,9 +388,9 @@ def test_reordering_keeps_rows_together(scene):
 
 
 def test_every_row_of_the_tables_can_be_made():
-    for name, table in paper_rows.TABLES.items():
-        for data in table.data:
-            rows = list(table.rows(data))
+    for name, shown in paper_rows.TABLES.items():
+        for data in shown.data:
+            rows = list(shown.rows(data))
             assert len({row.name for row in rows}) == len(rows)
             for row in rows:
                 assert row.missing or (row.params is None) != (row.peer is None)
