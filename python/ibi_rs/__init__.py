@@ -5,6 +5,7 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 
 from ibi_rs import features, metrics, plot, synth
 from ibi_rs._core import InputError, ParamsError, __version__
+from ibi_rs._detect import Matches
 from ibi_rs._match import match
 from ibi_rs._register import Model, register
 from ibi_rs.params import (
@@ -37,6 +38,7 @@ __all__ = [
     "Irls",
     "LocalGtm",
     "Mac",
+    "Matches",
     "Model",
     "Nnsr",
     "None_",

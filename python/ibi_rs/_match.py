@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._register import _aligned, _num_threads, _real
+from ibi_rs._inputs import _aligned, _num_threads, _real
 from ibi_rs.features import _count, _number
 
 

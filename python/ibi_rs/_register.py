@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
-import os
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs import _core
+from ibi_rs import _core, _detect, features
+from ibi_rs._detect import Matches
+from ibi_rs._inputs import (
+    Points,
+    _correspondences,
+    _frames,
+    _num_threads,
+    _points,
+    _vector,
+    _viewpoint,
+)
+from ibi_rs._match import match
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
-
-Points = Any
-"""(N, 3) real numbers, or an object with ``.points``, ``.vertices`` or ``__array__``."""
-
-_MAX_THREADS = 65535
-"""As many as rayon can tell apart."""
 
 
 def register(
@@ -151,6 +156,9 @@ class Model:
     5
     """
 
+    _voxel: float
+    _features: npt.NDArray[np.float32] | None = None
+
     def __init__(
         self,
         src: Points,
@@ -165,6 +173,70 @@ class Model:
         # Copies: the caller's arrays may change, the prepared source does not.
         self._points, self._normals = _frozen(points), None if of_points is None else _frozen(of_points)
         self._frames = None if axes is None else _frozen(axes)
+        self._voxel = _detect.VOXELS_PER_SPACING * self.spacing
+
+    @classmethod
+    def from_mesh(
+        cls,
+        vertices: Any,
+        faces: npt.ArrayLike | None = None,
+        *,
+        voxel: float | None = None,
+        num_threads: int | None = None,
+    ) -> Model:
+        """Make a model of points on the outer surface of a mesh: a CAD file.
+
+        What lies within the part is left out, as no camera sees it.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array_like
+            In the unit of the scenes; or an object with ``.vertices`` and ``.faces`` (trimesh), or with
+            ``.vertices`` and ``.triangles`` (Open3D).
+        faces : (F, 3) array_like of int
+            Rows of ``vertices``, counter-clockwise as seen from outside. Left out where the object has them.
+        voxel : float, optional
+            Spacing of the points, data units; above 0. By default 1/24 of the diagonal of the mesh. A scan
+            should not be much coarser.
+        num_threads : int, optional
+            As in :func:`register`.
+
+        Returns
+        -------
+        Model
+            With normals.
+
+        Raises
+        ------
+        InputError
+            The mesh has no faces, or has a value that is not finite, or a face names no vertex, or none is
+            seen from outside; or the voxel is not above 0.
+        TypeError
+            An argument is of another type than above.
+
+        Examples
+        --------
+        >>> import ibi_rs as ibi
+        >>> corners = [[x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 1)]
+        >>> sides = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        ...          [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+        >>> model = ibi.Model.from_mesh(corners, sides)
+        >>> round(model.diameter, 1)
+        3.7
+        """
+        if faces is None:
+            faces = getattr(vertices, "faces", getattr(vertices, "triangles", None))
+            if faces is None or len(faces) == 0:
+                raise _core.InputError("faces: the mesh has none; a cloud goes to Model(src, normals=...)")
+        if voxel is not None:
+            voxel = features._number("voxel", voxel)
+            if not 0 < voxel < math.inf:
+                raise _core.InputError(f"voxel is {voxel:g}; it must be above 0 and finite")
+        mesh = _points("vertices", vertices), features._faces(faces)
+        points, normals, voxel = _detect.mesh_points(*mesh, voxel, num_threads)
+        model = cls(points, normals=normals)
+        model._voxel = voxel
+        return model
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
@@ -187,6 +259,11 @@ class Model:
         return self._source.spacing
 
     @property
+    def voxel(self) -> float:
+        """What :meth:`detect` thins a scene to, data units: the mesh's voxel, or 1.25 times the spacing."""
+        return self._voxel
+
+    @property
     def diameter(self) -> float:
         """Largest distance of two points, in data units; measured when first asked for."""
         return self._source.diameter
@@ -199,10 +276,137 @@ class Model:
         return f"Model({len(self)} points, {normals} normals, spacing {self.spacing:.4g})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"points": self._points, "normals": self._normals, "frames": self._frames}
+        state = {"points": self._points, "normals": self._normals, "frames": self._frames}
+        return state | {"voxel": self._voxel}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         Model.__init__(self, state["points"], normals=state["normals"], frames=state["frames"])
+        self._voxel = state["voxel"]
+
+    def correspond(
+        self,
+        tgt: Points,
+        *,
+        tgt_normals: npt.ArrayLike | None = None,
+        viewpoint: npt.ArrayLike | None = None,
+        remove_plane: bool | None = None,
+        num_threads: int | None = None,
+    ) -> Matches:
+        """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
+
+        The scene is thinned to :attr:`voxel`, its table taken away, its normals estimated; both clouds are
+        described by FPFH over 6 voxels, and each scene point is joined to the two model points most like it.
+
+        Parameters
+        ----------
+        tgt, tgt_normals, viewpoint, remove_plane, num_threads
+            As in :meth:`detect`.
+
+        Returns
+        -------
+        Matches
+            ``tgt, tgt_normals, corr, similarity``, for :meth:`register`.
+
+        Raises
+        ------
+        InputError, TypeError, ValueError
+            Those of :meth:`detect`.
+        """
+        if self._normals is None:
+            raise _core.InputError("src_normals: detection needs them; give normals=, or use Model.from_mesh")
+        if viewpoint is None and tgt_normals is None:
+            raise _core.InputError(
+                "viewpoint: give it (the camera's place, [0, 0, 0] in most scans) or tgt_normals: "
+                "descriptors have to know which side of a surface is the outer one"
+            )
+        points = _points("tgt", tgt)
+        _detect.check_units(self.diameter, points)
+        scene, normals = _detect.scene_points(
+            points,
+            None if tgt_normals is None else _points("tgt_normals", tgt_normals),
+            self._voxel,
+            viewpoint,
+            remove_plane,
+            num_threads,
+        )
+        if self._features is None:
+            self._features = _detect.describe(self._points, self._normals, self._voxel, num_threads)
+        described = _detect.describe(scene, normals, self._voxel, num_threads)
+        corr, similarity = match(self._features, described, k=_detect.PER_POINT, num_threads=num_threads)
+        return Matches(scene, normals, corr, similarity)
+
+    def detect(
+        self,
+        tgt: Points,
+        params: Params | None = None,
+        *,
+        tgt_normals: npt.ArrayLike | None = None,
+        viewpoint: npt.ArrayLike | None = None,
+        remove_plane: bool | None = None,
+        num_threads: int | None = None,
+        max_instances: int | None = None,
+        timeout_s: float | None = None,
+        callback: Callable[[Round], object] | None = None,
+    ) -> Registration:
+        """Find every instance of this model in a scan: :meth:`correspond`, then :meth:`register`.
+
+        Parameters
+        ----------
+        tgt : (N, 3) array_like
+            The scan, as in :func:`register`, in the unit of the model.
+        params : Params, optional
+            By default ``Params.single_view()`` with a viewpoint and ``Params()`` without one.
+        tgt_normals : (N, 3) array_like, optional
+            Outwards. By default they are estimated, and face the viewpoint.
+        viewpoint : (3,) array_like
+            Where the depth camera stood, in the frame of ``tgt``: ``[0, 0, 0]`` for most scans. It may be
+            left out where normals are given, for scenes that are seen from all sides.
+        remove_plane : bool, optional
+            Whether the plane with most points is taken away. By default it is where it looks like a table:
+            less than 2 % of the points lie behind it, as the viewpoint sees it.
+        num_threads, max_instances, timeout_s, callback
+            As in :func:`register`.
+
+        Returns
+        -------
+        Registration
+            Its ``labels`` and ``inliers`` are rows of the correspondences of :meth:`correspond`.
+
+        Raises
+        ------
+        InputError
+            As :func:`register`; the model has no normals, neither a viewpoint nor normals are given, or the
+            scene cannot be in the unit of the model, being 10 times smaller or 300 times larger.
+        TypeError, ValueError
+            As :func:`register`.
+
+        Examples
+        --------
+        >>> import ibi_rs as ibi, trimesh                                          # doctest: +SKIP
+        >>> part = ibi.Model.from_mesh(trimesh.load("part.stl"))                   # doctest: +SKIP
+        >>> found = part.detect(trimesh.load("scan.ply"), viewpoint=[0, 0, 0])     # doctest: +SKIP
+        """
+        matches = self.correspond(
+            tgt,
+            tgt_normals=tgt_normals,
+            viewpoint=viewpoint,
+            remove_plane=remove_plane,
+            num_threads=num_threads,
+        )
+        if params is None:
+            params = Params() if viewpoint is None else Params.single_view()
+        return self.register(
+            matches.tgt,
+            matches.corr,
+            params,
+            tgt_normals=matches.tgt_normals,
+            similarity=matches.similarity,
+            viewpoint=viewpoint,
+            num_threads=num_threads,
+            max_instances=max_instances,
+            timeout_s=timeout_s,
+            callback=callback,
+        )
 
     def register(
         self,
@@ -277,105 +481,3 @@ def _registration(raw: dict[str, Any], params: Params) -> Registration:
         resolution=raw["resolution"],
         params=params,
     )
-
-
-def _real(name: str, value: Any) -> npt.NDArray[Any]:
-    """Any array of real numbers."""
-    try:
-        array = np.asarray(value)
-    except ValueError as error:  # ragged lists
-        raise _core.InputError(f"{name} is not a rectangular array: {error}") from None
-    if array.dtype.kind not in "fiu":  # a timedelta is an np.integer
-        raise TypeError(f"{name} has dtype {array.dtype}; it must be real numbers")
-    return array
-
-
-def _aligned(array: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
-    """Copy what the core cannot read in place: it takes a field of a packed record for something else."""
-    with np.errstate(over="ignore"):  # of longdouble; the core refuses infinity
-        return np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"])
-
-
-def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
-    """(N, 3) float64, from an array or from an object that holds one."""
-    if not isinstance(value, np.ndarray):
-        for attribute in ("points", "vertices"):
-            value = getattr(value, attribute, value)
-    array = _real(name, value)
-    if array.shape == (0,):
-        array = array.reshape(0, 3)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
-    return _aligned(array, np.float64)
-
-
-def _frames(name: str, value: Any) -> npt.NDArray[np.float64]:
-    array = _real(name, value)
-    if array.ndim != 3 or array.shape[1:] != (3, 3):
-        raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, 3, 3)")
-    return _aligned(array, np.float64)
-
-
-def _vector(name: str, value: Any) -> npt.NDArray[np.float64]:
-    array = _real(name, value)
-    if array.ndim != 1:
-        raise _core.InputError(f"{name} has shape {array.shape}; it must be (M,)")
-    return _aligned(array, np.float64)
-
-
-def _viewpoint(value: Any) -> list[float]:
-    array = _real("viewpoint", value)
-    if array.shape != (3,):
-        raise _core.InputError(f"viewpoint has shape {array.shape}; it must be (3,)")
-    return [float(x) for x in array]
-
-
-def _correspondences(value: Any) -> npt.NDArray[Any]:
-    """(M, 2) int64 rows or (M, 6) float64 points."""
-    if isinstance(value, (tuple, list)) and len(value) == 2 and all(map(_is_rows3, value)):
-        source, target = _points("corr[0]", value[0]), _points("corr[1]", value[1])
-        if len(source) != len(target):
-            raise _core.InputError(
-                f"corr is a pair of {len(source)} and {len(target)} points; it must be of equally many"
-            )
-        return np.hstack([source, target])
-    if not isinstance(value, np.ndarray):
-        value = getattr(value, "correspondence_set", value)  # Open3D's RegistrationResult
-    if isinstance(value, (tuple, list, np.ndarray)) and len(value) == 0:  # of any dtype
-        return np.empty((0, 2), np.int64)
-    array = _real("corr", value)
-    if array.shape == (0,):
-        return np.empty((0, 2), np.int64)
-    if array.ndim != 2 or array.shape[1] not in (2, 6):
-        raise _core.InputError(f"corr has shape {array.shape}; it must be (M, 2) rows or (M, 6) points")
-    if array.shape[1] == 6:
-        return _aligned(array, np.float64)
-    if not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(f"corr of shape (M, 2) has dtype {array.dtype}; rows must be integers")
-    # Indices beyond int64 are out of any range; clipped, the core still refuses them and says where.
-    if array.dtype == np.uint64:
-        array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
-    return _aligned(array, np.int64)
-
-
-def _is_rows3(side: Any) -> bool:
-    """Whether this is a list of points, of which two make a pair, and not one row of indices."""
-    try:
-        shape = np.shape(side)
-    except ValueError:  # ragged; who reads it next says so
-        return False
-    return len(shape) == 2 and shape[1] == 3
-
-
-def _num_threads(value: int | None) -> int | None:
-    name: str = "num_threads"
-    given: Any = value
-    if given is None:
-        name, given = "IBI_NUM_THREADS", os.environ.get("IBI_NUM_THREADS", "")
-        if not given:
-            return None
-        given = int(given) if given.isdecimal() and len(given) < 10 else given
-    is_integer = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
-    if not is_integer or not 1 <= given <= _MAX_THREADS:
-        raise ValueError(f"{name} is {given!r}; it must be an integer from 1 to {_MAX_THREADS}")
-    return int(given)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._register import Points, _aligned, _num_threads, _points, _real, _viewpoint
+from ibi_rs._inputs import Points, _aligned, _num_threads, _points, _real, _viewpoint
 
 __all__ = [
     "Plane",

@@ -1,0 +1,119 @@
+"""What users hold, as arrays that the core takes."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ibi_rs._core import InputError
+
+Points = Any
+"""(N, 3) real numbers, or an object with ``.points``, ``.vertices`` or ``__array__``."""
+
+_MAX_THREADS = 65535
+"""As many as rayon can tell apart."""
+
+
+def _real(name: str, value: Any) -> npt.NDArray[Any]:
+    """Any array of real numbers."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # ragged lists
+        raise InputError(f"{name} is not a rectangular array: {error}") from None
+    if array.dtype.kind not in "fiu":  # a timedelta is an np.integer
+        raise TypeError(f"{name} has dtype {array.dtype}; it must be real numbers")
+    return array
+
+
+def _aligned(array: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
+    """Copy what the core cannot read in place: it takes a field of a packed record for something else."""
+    with np.errstate(over="ignore"):  # of longdouble; the core refuses infinity
+        return np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"])
+
+
+def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
+    """(N, 3) float64, from an array or from an object that holds one."""
+    if not isinstance(value, np.ndarray):
+        for attribute in ("points", "vertices"):
+            value = getattr(value, attribute, value)
+    array = _real(name, value)
+    if array.shape == (0,):
+        array = array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
+    return _aligned(array, np.float64)
+
+
+def _frames(name: str, value: Any) -> npt.NDArray[np.float64]:
+    array = _real(name, value)
+    if array.ndim != 3 or array.shape[1:] != (3, 3):
+        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3, 3)")
+    return _aligned(array, np.float64)
+
+
+def _vector(name: str, value: Any) -> npt.NDArray[np.float64]:
+    array = _real(name, value)
+    if array.ndim != 1:
+        raise InputError(f"{name} has shape {array.shape}; it must be (M,)")
+    return _aligned(array, np.float64)
+
+
+def _viewpoint(value: Any) -> list[float]:
+    array = _real("viewpoint", value)
+    if array.shape != (3,):
+        raise InputError(f"viewpoint has shape {array.shape}; it must be (3,)")
+    return [float(x) for x in array]
+
+
+def _correspondences(value: Any) -> npt.NDArray[Any]:
+    """(M, 2) int64 rows or (M, 6) float64 points."""
+    if isinstance(value, (tuple, list)) and len(value) == 2 and all(map(_is_rows3, value)):
+        source, target = _points("corr[0]", value[0]), _points("corr[1]", value[1])
+        if len(source) != len(target):
+            raise InputError(
+                f"corr is a pair of {len(source)} and {len(target)} points; it must be of equally many"
+            )
+        return np.hstack([source, target])
+    if not isinstance(value, np.ndarray):
+        value = getattr(value, "correspondence_set", value)  # Open3D's RegistrationResult
+    if isinstance(value, (tuple, list, np.ndarray)) and len(value) == 0:  # of any dtype
+        return np.empty((0, 2), np.int64)
+    array = _real("corr", value)
+    if array.shape == (0,):
+        return np.empty((0, 2), np.int64)
+    if array.ndim != 2 or array.shape[1] not in (2, 6):
+        raise InputError(f"corr has shape {array.shape}; it must be (M, 2) rows or (M, 6) points")
+    if array.shape[1] == 6:
+        return _aligned(array, np.float64)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise TypeError(f"corr of shape (M, 2) has dtype {array.dtype}; rows must be integers")
+    # Indices beyond int64 are out of any range; clipped, the core still refuses them and says where.
+    if array.dtype == np.uint64:
+        array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
+    return _aligned(array, np.int64)
+
+
+def _is_rows3(side: Any) -> bool:
+    """Whether this is a list of points, of which two make a pair, and not one row of indices."""
+    try:
+        shape = np.shape(side)
+    except ValueError:  # ragged; who reads it next says so
+        return False
+    return len(shape) == 2 and shape[1] == 3
+
+
+def _num_threads(value: int | None) -> int | None:
+    name: str = "num_threads"
+    given: Any = value
+    if given is None:
+        name, given = "IBI_NUM_THREADS", os.environ.get("IBI_NUM_THREADS", "")
+        if not given:
+            return None
+        given = int(given) if given.isdecimal() and len(given) < 10 else given
+    is_integer = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
+    if not is_integer or not 1 <= given <= _MAX_THREADS:
+        raise ValueError(f"{name} is {given!r}; it must be an integer from 1 to {_MAX_THREADS}")
+    return int(given)

@@ -1,0 +1,141 @@
+"""`Model.from_mesh` and `Model.detect`: from a mesh and a scan to poses, and what they refuse."""
+
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
+
+import ibi_rs as ibi
+import numpy as np
+import pytest
+from ibi_rs import metrics
+
+from test_features import box, read_ply
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+CAMERA = [0, 0, 0]
+
+
+def example(name):
+    """Mesh, scan as it was taken, labelled poses."""
+    folder = EXAMPLES / ("tee" if name == "tee6" else "provete2")
+    with np.load(folder / f"{name}.npz") as file:
+        poses = file["poses"]
+    return read_ply(next(folder.glob("model_*_mesh.ply"))), read_scan(folder / f"{name}.ply"), poses
+
+
+def read_scan(path):
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    assert b"property float x\nproperty float y\nproperty float z" in header
+    return np.frombuffer(body, "<f4").reshape(-1, 3).astype(float)
+
+
+@pytest.fixture(scope="module")
+def tee():
+    return ibi.Model.from_mesh(*read_ply(EXAMPLES / "tee/model_tee_mesh.ply"))
+
+
+@pytest.mark.parametrize(("name", "extra"), [("tee6", 0), ("two", 0), ("multi", 2)])
+def test_the_labelled_parts_are_found(name, extra):
+    # In `multi` parts without a label can be seen.
+    mesh, scan, labels = example(name)
+    model = ibi.Model.from_mesh(*mesh)
+    found = model.detect(scan, viewpoint=CAMERA)
+    score = metrics.score_scene(found, labels, criterion=metrics.ADD_S, model=model.points)
+    assert score.num_truth_hit == len(labels)
+    assert len(found) <= len(labels) + extra
+
+
+def test_detect_is_correspond_and_register(tee):
+    _, scan, _ = example("tee6")
+    tgt, tgt_normals, corr, similarity = tee.correspond(scan, viewpoint=CAMERA)
+    assert len(tgt) < len(scan)
+    assert corr.shape == (2 * len(tgt), 2)
+    assert similarity.shape == (len(corr),)
+    np.testing.assert_allclose(np.linalg.norm(tgt_normals, axis=1), 1)
+    assert np.einsum("ij,ij->i", tgt_normals, tgt).max() <= 1e-12  # towards the camera
+    by_hand = tee.register(
+        tgt, corr, ibi.Params.single_view(), tgt_normals=tgt_normals, similarity=similarity, viewpoint=CAMERA
+    )
+    np.testing.assert_array_equal(tee.detect(scan, viewpoint=CAMERA), by_hand)
+
+
+def test_threads_and_pickling_change_nothing(tee):
+    _, scan, _ = example("tee6")
+    found = tee.detect(scan, viewpoint=CAMERA, num_threads=2)
+    again = pickle.loads(pickle.dumps(tee))
+    assert again.voxel == tee.voxel
+    np.testing.assert_array_equal(again.detect(scan, viewpoint=CAMERA, num_threads=1), found)
+
+
+def test_a_scan_in_millimetres_gives_the_same_parts():
+    (vertices, faces), scan, labels = example("two")
+    model = ibi.Model.from_mesh(1000 * vertices, faces)
+    found = np.array(model.detect(1000 * scan, viewpoint=CAMERA))
+    found[:, :3, 3] /= 1000
+    score = metrics.score_scene(found, labels, criterion=metrics.ADD_S, model=model.points / 1000)
+    assert score.num_truth_hit == 2
+
+
+def on_a_table(scan, share=1.0):
+    """The scan with a table below: a grid behind all of it, as the camera sees it."""
+    low, high = scan.min(axis=0), scan.max(axis=0)
+    x, y = np.mgrid[low[0] : high[0] : 0.003, low[1] : high[1] : 0.003]
+    return np.concatenate([scan, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, high[2] + 0.004)])])
+
+
+def test_a_table_goes_and_parts_stay(tee):
+    _, scan, labels = example("tee6")
+    matches = tee.correspond(on_a_table(scan), viewpoint=CAMERA)
+    assert matches.tgt[:, 2].max() < scan[:, 2].max() + 0.002
+    kept = tee.correspond(on_a_table(scan), viewpoint=CAMERA, remove_plane=False)
+    assert len(kept.tgt) > len(matches.tgt)
+    # Without a table nothing goes, unless it is asked for.
+    whole = tee.correspond(scan, viewpoint=CAMERA)
+    assert len(whole.tgt) == len(tee.correspond(scan, viewpoint=CAMERA, remove_plane=False).tgt)
+    assert len(whole.tgt) > len(tee.correspond(scan, viewpoint=CAMERA, remove_plane=True).tgt)
+    found = tee.detect(on_a_table(scan), viewpoint=CAMERA)
+    score = metrics.score_scene(found, labels, criterion=metrics.ADD_S, model=tee.points)
+    assert score.num_truth_hit >= 5
+
+
+def test_a_mesh_is_an_object_or_arrays():
+    vertices, faces = box(np.array([3.0, 2.0, 1.0]))
+    of_arrays = ibi.Model.from_mesh(vertices, faces)
+    of_trimesh = ibi.Model.from_mesh(SimpleNamespace(vertices=vertices, faces=faces))
+    of_open3d = ibi.Model.from_mesh(SimpleNamespace(vertices=vertices, triangles=faces))
+    np.testing.assert_array_equal(of_arrays.points, of_trimesh.points)
+    np.testing.assert_array_equal(of_arrays.points, of_open3d.points)
+    assert of_arrays.voxel == pytest.approx(of_arrays.diameter / 24, rel=0.05)
+    assert of_arrays.normals.shape == of_arrays.points.shape
+
+
+def test_a_model_of_points_has_a_voxel_too():
+    points, _ = ibi.features.voxel_downsample(
+        np.random.default_rng(0).uniform(size=(40_000, 3)) * [1, 1, 0], 0.05
+    )
+    assert ibi.Model(points).voxel == pytest.approx(0.05, rel=0.3)
+
+
+MODEL = ibi.Model.from_mesh(*box(np.ones(3)))
+SCAN = np.random.default_rng(0).normal(size=(500, 3))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ibi.Model.from_mesh(SCAN), "faces: the mesh has none"),
+        (lambda: ibi.Model.from_mesh(SimpleNamespace(vertices=SCAN, faces=[])), "faces: the mesh has none"),
+        (lambda: ibi.Model.from_mesh(SCAN, [[0, 1, 500]]), "faces"),
+        (lambda: ibi.Model.from_mesh(*box(np.ones(3)), voxel=0), "voxel"),
+        (lambda: ibi.Model(SCAN).detect(SCAN, viewpoint=CAMERA), "src_normals: detection needs them"),
+        (lambda: MODEL.detect(SCAN), "viewpoint: give it"),
+        (lambda: MODEL.detect(SCAN * 1000, viewpoint=CAMERA), "same unit"),
+        (lambda: MODEL.detect(SCAN * 0.001, viewpoint=CAMERA), "same unit"),
+        (lambda: MODEL.detect(np.empty((0, 3)), viewpoint=CAMERA), "tgt"),
+        (lambda: MODEL.detect(np.full((5, 3), np.nan), viewpoint=CAMERA), "tgt"),
+        (lambda: MODEL.detect(SCAN, viewpoint=[0, 0]), "viewpoint"),
+    ],
+)
+def test_bad_input_is_refused_by_name(call, message):
+    with pytest.raises(ibi.InputError, match=message):
+        call()
