@@ -60,6 +60,10 @@ paper-tables: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## the last of these 
 bench-peers: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## compare with PCL, Open3D, KISS-Matcher, OpenCV, ECC; ARGS=--help tells more
 	$(BIN)/python benchmarks/compare.py $(ARGS)
 
+.PHONY: bench-detect
+bench-detect: $(STAMPS)/package $(STAMPS)/group-test ## from mesh and scan to poses on the real scans; ARGS=--docs records
+	$(BIN)/python benchmarks/detect.py $(ARGS)
+
 .PHONY: bench-speed
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py

@@ -1,6 +1,8 @@
 """`Model.from_mesh` and `Model.detect`: from a mesh and a scan to poses, and what they refuse."""
 
+import csv
 import pickle
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,7 +10,6 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import metrics
-
 from test_features import box, read_ply
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -139,3 +140,13 @@ SCAN = np.random.default_rng(0).normal(size=(500, 3))
 def test_bad_input_is_refused_by_name(call, message):
     with pytest.raises(ibi.InputError, match=message):
         call()
+
+
+def test_the_page_has_the_figures_of_the_record():
+    root = Path(__file__).parents[1]
+    sys.path.insert(0, str(root / "benchmarks"))
+    from detect import RECORD, markdown
+
+    with RECORD.open(newline="", encoding="utf-8") as file:
+        table = markdown(list(csv.DictReader(file)))
+    assert table in (root / "docs/features.md").read_text(encoding="utf-8"), "run benchmarks/detect.py --docs"
