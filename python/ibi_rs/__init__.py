@@ -3,7 +3,7 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import features, metrics, plot, synth
+from ibi_rs import features, metrics, plot, stages, synth
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._match import match
 from ibi_rs._register import Model, register
@@ -59,5 +59,6 @@ __all__ = [
     "metrics",
     "plot",
     "register",
+    "stages",
     "synth",
 ]
