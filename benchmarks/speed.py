@@ -2,6 +2,7 @@
 
     python benchmarks/speed.py                         # or: make bench-speed
     python benchmarks/speed.py --part rows --repeats 3
+    python benchmarks/speed.py --part stages           # what a stage of your own costs; leaves no record
 
 Time is that of the whole call from Python. Of a scene the median over the repeats counts, of a row the median
 over its scenes; one run before them warms up. Stages are those of the run nearest to that median; `other` is
@@ -423,13 +424,43 @@ def draw(points: list[Point], path: Path) -> None:
     figure.savefig(path, dpi=90)
 
 
+# Stages of your own ---------------------------------------------------------------------------------------
+
+
+def own_off(_context: ibi.stages.StageContext, seeds: ibi.stages.Ranked) -> ibi.stages.Ranked:
+    """CE ``off`` as a callable: it does nothing, so that what it takes is the call."""
+    return seeds
+
+
+def run_stages(repeats: int) -> None:
+    """Print what calls into Python cost: runs with ``ce="off"``, and with a callable that does the same."""
+    heads = ("M", "threads", "calls", "us a call", "ms, ce=off", "ms, ce=callable")
+    print(f"\n| {' | '.join(heads)} |\n|{'---|' * len(heads)}", flush=True)
+    for size in (1000, 10_000, 100_000):
+        scene = by_m(size)
+        for num_threads in (1, 2):
+            ms = {}
+            for name, ce in (("off", ibi.Off()), ("own", own_off)):
+                params = ibi.Params(ce=ce)
+                ms[name] = 1e3 * median_run(scene, params, num_threads, repeats).seconds
+            found = [register(scene, ibi.Params(ce=own_off), num_threads) for _ in range(repeats)]
+            calls = len(found[0].rounds)
+            us = 1e6 * np.median([each.timings.ce_s for each in found]) / calls
+            cells = (size, num_threads, calls, f"{us:.0f}", f"{ms['off']:.1f}", f"{ms['own']:.1f}")
+            print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
 def main() -> None:
     """Run, print, record, draw."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--part", nargs="+", choices=("rows", "scaling"), default=["rows", "scaling"])
-    parser.add_argument("--repeats", type=int, help="timed runs of each scene; default: rows 9, scaling 3")
+    parser.add_argument(
+        "--part", nargs="+", choices=("rows", "scaling", "stages"), default=["rows", "scaling"]
+    )
+    parser.add_argument(
+        "--repeats", type=int, help="timed runs of each scene; default: rows and stages 9, scaling 3"
+    )
     parser.add_argument(
         "--out",
         type=Path,
@@ -445,6 +476,8 @@ def main() -> None:
         record = run_rows(args.repeats or 9)
         if keep:
             write_csv((args.out or RECORDS) / "speed.csv", record)
+    if "stages" in args.part:
+        run_stages(args.repeats or 9)
     if "scaling" in args.part:
         points = run_scaling(args.repeats or 3)
         if keep:

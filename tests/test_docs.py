@@ -39,8 +39,8 @@ def test_examples_in_docstrings_print_what_they_say(name):
 
 
 def public():
-    """What the four namespaces export, each with its name."""
-    for module in (ibi, ibi.features, ibi.metrics, ibi.synth):
+    """What the five namespaces export, each with its name."""
+    for module in (ibi, ibi.features, ibi.metrics, ibi.stages, ibi.synth):
         for name in module.__all__:
             thing = getattr(module, name)
             if inspect.isfunction(thing) or inspect.isclass(thing):
@@ -105,7 +105,7 @@ def test_the_attributes_of_a_registration_are_explained():
     assert entries(inspect.getdoc(ibi.Registration), "Attributes") >= held
 
 
-# README --------------------------------------------------------------------------------------------------
+# Pages ---------------------------------------------------------------------------------------------------
 
 # A block of Python, and the block of text that follows it with nothing but blank lines between.
 BLOCK = re.compile(r"^```python\n(.*?)^```$(?:\s*^```text\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
@@ -139,10 +139,11 @@ def beside_examples(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_readme_runs(beside_examples):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert blocks(text), "README.md shows no Python"
-    run_blocks(text, "README.md")
+@pytest.mark.parametrize("name", ["README.md", "docs/stages.md"])
+def test_a_page_runs(name, beside_examples):
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert blocks(text), f"{name} shows no Python"
+    run_blocks(text, name)
 
 
 PAGE = """\

@@ -3,7 +3,7 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import features, io, metrics, plot, synth
+from ibi_rs import features, io, metrics, plot, stages, synth
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._detect import Matches
 from ibi_rs._match import match
@@ -62,5 +62,6 @@ __all__ = [
     "metrics",
     "plot",
     "register",
+    "stages",
     "synth",
 ]

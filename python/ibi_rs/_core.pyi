@@ -81,6 +81,10 @@ def register(
     viewpoint: Sequence[float] | None = None,
     num_threads: int | None = None,
     on_round: Callable[[str], object] | None = None,
+    scs: Callable[..., object] | None = None,
+    ce: Callable[..., object] | None = None,
+    te: Callable[..., object] | None = None,
+    hv: Callable[..., object] | None = None,
 ) -> dict[str, Any]:
     """Arrays, one entry per pose: target_from_source (K, 4, 4), score, overlap, inlier_rmse, inliers, round.
 

@@ -24,6 +24,7 @@ from ibi_rs._inputs import (
 from ibi_rs._match import match
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
+from ibi_rs.stages import Run
 
 
 def register(
@@ -85,7 +86,8 @@ def register(
     ------
     InputError
         An array has a wrong shape, a value that is not finite, or an index out of range, or a variant needs
-        one that is not given; the message names the argument, the place and what is allowed. A ValueError.
+        one that is not given, or a stage of your own returns what cannot be used; the message names the
+        argument, the place and what is allowed. A ValueError.
     ParamsError
         A parameter is out of range. A ValueError.
     TypeError
@@ -95,7 +97,8 @@ def register(
 
     Notes
     -----
-    The GIL is released. Ctrl-C ends the run within 0.1 s.
+    The GIL is released. Ctrl-C ends the run within 0.1 s. Stages of your own are called in the thread that
+    called this function; an exception in one, Ctrl-C among them, ends the run and is raised as it is.
 
     References
     ----------
@@ -435,17 +438,21 @@ class Model:
         overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
         params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
 
+        target, pairs, own = _points("tgt", tgt), _correspondences(corr), params._own()
+        # Copies the scene for them, so only where there is one.
+        run = Run(self._points, target, pairs, params.seed) if own else None
         raw = _core.register(
             self._source,
-            _points("tgt", tgt),
-            _correspondences(corr),
-            json.dumps(params.to_dict()),
+            target,
+            pairs,
+            params._to_json(),
             tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
             tgt_frames=None if tgt_frames is None else _frames("tgt_frames", tgt_frames),
             similarity=None if similarity is None else _vector("similarity", similarity),
             viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
             num_threads=_num_threads(num_threads),
             on_round=None if callback is None else _on_round(callback),
+            **({} if run is None else {name: run.stage(name, stage) for name, stage in own.items()}),
         )
         return _registration(raw, params)
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
-from ibi_rs import _core
+from ibi_rs import _core, stages
 
 _P = TypeVar("_P", bound="Params")
 
@@ -402,7 +402,8 @@ class Params:
         t_s: a run ends when fewer seeds than this are found; at least 3.
     scs, ce, te, hv
         The four stages: seed correspondence selection, correspondence enhancement, transformation estimation,
-        hypothesis validation.
+        hypothesis validation. Each is a variant, or a callable of your own: :mod:`ibi_rs.stages`. Parameters
+        with a callable are equal, hash and pickle as the callable does, and cannot be written to a file.
     refine
         How a hypothesis is polished on the clouds: ``"none"``, or ``"icp"``, iterative closest points,
         point-to-plane where normals count. Of an accepted one the better of before and after stays, and at
@@ -446,10 +447,10 @@ class Params:
     min_normal_cos: float | None = 0.3
     oriented_normals: bool = False
     t_s: int = 4
-    scs: Scs = LocalGtm()
-    ce: Ce = Voting()
-    te: Te = Irls()
-    hv: Hv = Evidence()
+    scs: Scs | stages.SelectSeeds = LocalGtm()
+    ce: Ce | stages.Enhance = Voting()
+    te: Te | stages.EstimatePose = Irls()
+    hv: Hv | stages.Validate = Evidence()
     refine: Refine = "icp"
     n_contest: int = 60
     joint_check: bool = True
@@ -465,12 +466,14 @@ class Params:
             stage = getattr(self, name)
             if isinstance(stage, str):
                 object.__setattr__(self, name, _variant(name, stage)())
-            elif not isinstance(stage, variants):
-                allowed = ", ".join(f"{variant.__name__}()" for variant in variants)
+            elif not isinstance(stage, variants) and not _is_own(stage):
+                allowed = ", ".join([*(f"{variant.__name__}()" for variant in variants), "a callable"])
                 raise _core.ParamsError(f"params.{name} is {_shown(stage)}; it must be one of {allowed}")
         # numpy scalars become plain numbers here, so that equality, repr and pickles are those of plain data.
         complete = json.loads(_core.check_params(self._to_json()))
         for name, value in _build(complete).items():
+            if name in self._own():
+                continue
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -499,14 +502,13 @@ class Params:
         return dataclasses.replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain nested data; each stage carries its word under ``variant``."""
-        out: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in _STAGES:
-                value = {"variant": value.variant, **dataclasses.asdict(value)}
-            out[field.name] = value
-        return out
+        """Return plain nested data; each stage carries its word under ``variant``.
+
+        Raises ParamsError, as do :meth:`to_toml` and :meth:`save`, if a stage is a callable.
+        """
+        for name, own in self._own().items():
+            raise _core.ParamsError(f"params.{name} is {_shown(own)}; a callable has no text form")
+        return self._built_in()
 
     @classmethod
     def from_dict(cls: type[_P], data: Mapping[str, Any]) -> _P:
@@ -521,7 +523,7 @@ class Params:
 
     def to_toml(self) -> str:
         """Return the text of a parameter file."""
-        return _core.params_to_toml(self._to_json())
+        return _core.params_to_toml(_dumps(self.to_dict()))
 
     @classmethod
     def from_toml(cls: type[_P], text: str) -> _P:
@@ -545,8 +547,29 @@ class Params:
         except ValueError as error:  # of the text, the parameters or the encoding
             raise _core.ParamsError(f"{path}: {error}") from None
 
+    def _own(self) -> dict[str, Callable[..., Any]]:
+        """Return the stages that are callables."""
+        return {name: getattr(self, name) for name in _STAGES if _is_own(getattr(self, name))}
+
+    def _built_in(self) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in _STAGES:
+                if _is_own(value):
+                    continue
+                value = {"variant": value.variant, **dataclasses.asdict(value)}
+            out[field.name] = value
+        return out
+
     def _to_json(self) -> str:
-        return _dumps(self.to_dict())
+        """Write all but the callables, in the place of which the core has its defaults."""
+        return _dumps(self._built_in())
+
+
+def _is_own(stage: Any) -> bool:
+    """Whether it can be called for a stage; a class is more likely a variant without its brackets."""
+    return callable(stage) and not isinstance(stage, type)
 
 
 def _block(stage: str, value: Any) -> Mapping[str, Any]:

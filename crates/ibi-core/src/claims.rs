@@ -29,6 +29,12 @@ impl<'a> Claims<'a> {
         Self { defendant: Some(instance), ..self }
     }
 
+    /// The poses of the instances that claim, in the order they were found.
+    pub fn poses(&self) -> impl Iterator<Item = &'a Isometry3<f64>> + use<'a> {
+        let Self { found, defendant, .. } = *self;
+        (0..found.len()).filter(move |&at| Some(at) != defendant).map(|at| found[at].pose())
+    }
+
     /// Whether an accepted instance explains a row of the target. For many rows near one pose ask [`Self::near`].
     #[must_use]
     pub fn contains(&self, row: u32) -> bool {

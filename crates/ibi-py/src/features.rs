@@ -207,7 +207,7 @@ fn in_pool<T: Send>(
     num_threads: Option<usize>,
     job: impl FnOnce(&CancelToken) -> Result<T, FeatureError> + Send,
 ) -> PyResult<T> {
-    in_background(py, |cancel| {
+    in_background(py, |cancel, _| {
         let pool = Pool::new(num_threads).map_err(|error| to_py_err(&error))?;
         pool.install(|| job(&cancel)).map_err(to_py)
     })

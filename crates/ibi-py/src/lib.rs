@@ -4,6 +4,7 @@ mod features;
 mod metrics;
 mod params;
 mod register;
+mod stages;
 
 use pyo3::create_exception;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};

@@ -237,16 +237,22 @@ fn points(name: &str, array: &Points<'_>) -> PyResult<Vec<Point3<f64>>> {
 fn poses(name: &str, array: &Poses<'_>) -> PyResult<Vec<Isometry3<f64>>> {
     let matrices = array.as_array();
     let motions = matrices.axis_iter(Axis(0)).enumerate();
-    motions.map(|(row, matrix)| rigid_motion(&matrix, || format!("{name}[{row}]"))).collect()
+    motions
+        .map(|(row, matrix)| rigid_motion(&matrix, || format!("{name}[{row}]")).map_err(value_error))
+        .collect()
 }
 
 /// (4, 4) to a rigid motion.
 fn pose(name: &str, array: &Pose<'_>) -> PyResult<Isometry3<f64>> {
-    rigid_motion(&array.as_array(), || name.to_owned())
+    rigid_motion(&array.as_array(), || name.to_owned()).map_err(value_error)
 }
 
-fn rigid_motion(m: &ArrayView2<'_, f64>, name: impl Fn() -> String) -> PyResult<Isometry3<f64>> {
-    let must = |what: &str| Err(value_error(format!("{} must {what}", name())));
+/// The rigid motion of a (4, 4) matrix; else what is wrong with it, in words.
+pub(crate) fn rigid_motion(
+    m: &ArrayView2<'_, f64>,
+    name: impl Fn() -> String,
+) -> Result<Isometry3<f64>, String> {
+    let must = |what: &str| Err(format!("{} must {what}", name()));
     if m.shape() != [4, 4] {
         return must(&format!("have shape (4, 4), not {:?}", m.shape()));
     }

@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
-use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
 use ibi_core::nalgebra::{Matrix3, Point3, Vector3};
@@ -13,6 +13,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::stages::Own;
 use crate::{InputError, params, to_py_err};
 
 /// How often a run in the background lets Python look for Ctrl-C.
@@ -57,7 +58,7 @@ impl Source {
 
 /// See `ibi_rs.register`, which brings its arguments into the shapes and dtypes that are wanted here.
 #[pyfunction(name = "register")]
-#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, tgt_frames=None, similarity=None, viewpoint=None, num_threads=None, on_round=None))]
+#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, tgt_frames=None, similarity=None, viewpoint=None, num_threads=None, on_round=None, scs=None, ce=None, te=None, hv=None))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's keyword arguments; PyO3 owns
 fn register_clouds<'py>(
     py: Python<'py>,
@@ -71,6 +72,10 @@ fn register_clouds<'py>(
     viewpoint: Option<[f64; 3]>,
     num_threads: Option<usize>,
     on_round: Option<Py<PyAny>>,
+    scs: Option<Py<PyAny>>,
+    ce: Option<Py<PyAny>>,
+    te: Option<Py<PyAny>>,
+    hv: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = params::parse(params)?;
     let source = Arc::clone(&source.0);
@@ -85,19 +90,35 @@ fn register_clouds<'py>(
     if let Some(similarity) = similarity {
         correspondences = correspondences.with_similarity(similarity.as_array().to_vec());
     }
-    let registration = in_background(py, |cancel| {
+    let registration = in_background(py, |cancel, caller| {
         let mut failure = None;
-        let mut observer = |round: &Round| match tell(on_round.as_ref(), round) {
-            Ok(flow) => flow,
-            Err(error) => {
+        let has_failed = cancel.clone();
+        let mut observer = |round: &Round| {
+            if has_failed.is_cancelled() {
+                return ControlFlow::Break(()); // a round that a stage has failed in is none to tell of
+            }
+            tell(on_round.as_ref(), round).unwrap_or_else(|error| {
                 failure = Some(error);
                 ControlFlow::Break(())
-            }
+            })
         };
         let run = || {
             let mut registrar = Registrar::of(source).params(params).cancel_token(cancel);
             if let Some(num_threads) = num_threads {
                 registrar = registrar.num_threads(num_threads);
+            }
+            let own = |callable| Own::new(callable, caller.clone());
+            if let Some(scs) = scs {
+                registrar = registrar.with_scs(own(scs));
+            }
+            if let Some(ce) = ce {
+                registrar = registrar.with_ce(own(ce));
+            }
+            if let Some(te) = te {
+                registrar = registrar.with_te(own(te));
+            }
+            if let Some(hv) = hv {
+                registrar = registrar.with_hv(own(hv));
             }
             registrar.register_observed(&target, &correspondences, &mut observer)
         };
@@ -107,35 +128,74 @@ fn register_clouds<'py>(
     to_dict(py, &registration)
 }
 
+/// Lets a job in the background call Python in the thread that it was started from.
+///
+/// There alone signals are seen, so that Ctrl-C reaches what is called, and there the user's thread-local state holds:
+/// `numpy.errstate`, `torch.no_grad`. A thread of the pool would have to wait for the GIL as well.
+#[derive(Clone)]
+pub(crate) struct Caller {
+    calls: Sender<Call>,
+    cancel: CancelToken,
+}
+
+type Call = Box<dyn FnOnce(Python<'_>) -> PyResult<()> + Send>;
+
+impl Caller {
+    /// What `job` answers; `None` if it fails, or if another has failed or a signal has come before: the run is then
+    /// cancelled, and `in_background` raises the error.
+    pub(crate) fn call<T: Send + 'static>(
+        &self,
+        job: impl FnOnce(Python<'_>) -> PyResult<T> + Send + 'static,
+    ) -> Option<T> {
+        if self.cancel.is_cancelled() {
+            return None;
+        }
+        let (answer, answered) = channel();
+        let call: Call = Box::new(move |py| {
+            let _ = answer.send(job(py)?); // somebody waits for it
+            Ok(())
+        });
+        let answer = self.calls.send(call).ok().and_then(|()| answered.recv().ok());
+        if answer.is_none() {
+            self.cancel.cancel(); // here too, so that this thread sees it from now on
+        }
+        answer
+    }
+}
+
 /// Runs `job` on a thread of its own with the GIL released, while this one, which alone may see signals, looks
-/// for Ctrl-C. A signal cancels the job and is raised once the job has ended.
+/// for Ctrl-C and makes the calls that the job asks for. A signal, or an error of a call, cancels the job and is
+/// raised once the job has ended.
 pub(crate) fn in_background<T: Send>(
     py: Python<'_>,
-    job: impl FnOnce(CancelToken) -> PyResult<T> + Send,
+    job: impl FnOnce(CancelToken, Caller) -> PyResult<T> + Send,
 ) -> PyResult<T> {
     let cancel = CancelToken::default();
     let token = cancel.clone();
     py.detach(|| {
         std::thread::scope(|scope| {
-            let (done, is_done) = channel::<()>();
-            let worker = scope.spawn(move || {
-                let result = job(token);
-                drop(done);
-                result
-            });
-            let mut signal = Ok(());
-            while is_done.recv_timeout(SIGNAL_PERIOD) == Err(RecvTimeoutError::Timeout) {
-                if signal.is_ok() {
-                    #[allow(clippy::redundant_closure_for_method_calls)] // the lifetime wants the closure
-                    let checked = Python::attach(|py| py.check_signals());
-                    signal = checked;
-                    if signal.is_err() {
+            // The job's end is seen by this: with it goes the last sender.
+            let (calls, asked) = channel::<Call>();
+            let caller = Caller { calls, cancel: token.clone() };
+            let worker = scope.spawn(move || job(token, caller));
+            let mut outcome = Ok(());
+            loop {
+                let happened = asked.recv_timeout(SIGNAL_PERIOD);
+                if let Err(RecvTimeoutError::Disconnected) = happened {
+                    break;
+                }
+                if outcome.is_ok() {
+                    outcome = Python::attach(|py| match happened {
+                        Ok(call) => call(py),
+                        Err(_) => py.check_signals(),
+                    });
+                    if outcome.is_err() {
                         cancel.cancel();
                     }
                 }
             }
             let result = worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-            signal.and(result)
+            outcome.and(result)
         })
     })
 }

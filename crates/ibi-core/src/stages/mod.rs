@@ -113,6 +113,15 @@ impl Context<'_> {
         inliers
     }
 
+    /// The MAE of a pose over the alive correspondences (Eq. 7-8), of which only those near it are looked at.
+    #[must_use]
+    pub fn mae(&self, target_from_source: &Isometry3<f64>) -> f64 {
+        let inliers = self.inliers(target_from_source, self.params.t_he_pr);
+        let t_he = self.length(self.params.t_he_pr);
+        let pairs = self.pairs.pairs(inliers);
+        pairs.map(|(p, q)| (1.0 - (target_from_source * p - q).norm() / t_he).max(0.0)).sum()
+    }
+
     /// Alive correspondences that an accepted pose uses up: its inliers within 2 `t_he`, and those, right or
     /// wrong, whose target point it explains.
     #[must_use]

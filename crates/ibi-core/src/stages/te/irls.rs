@@ -50,7 +50,7 @@ impl EstimatePose for Irls {
                     None => break,
                 }
             }
-            Hypothesis { target_from_source: pose, score: mae_of(context, &pose) }
+            Hypothesis { target_from_source: pose, score: context.mae(&pose) }
         });
         Estimate {
             hypothesis,
@@ -59,13 +59,6 @@ impl EstimatePose for Irls {
             capped: false,
         }
     }
-}
-
-/// The MAE of a pose over the alive correspondences (Eq. 7-8), of which only those near it are looked at.
-fn mae_of(context: &Context<'_>, pose: &Isometry3<f64>) -> f64 {
-    let inliers = context.inliers(pose, context.params.t_he_pr);
-    let t_he = context.length(context.params.t_he_pr);
-    context.pairs.pairs(inliers).map(|(p, q)| (1.0 - (pose * p - q).norm() / t_he).max(0.0)).sum()
 }
 
 /// The fit to the alive correspondences within `distance_pr` of `pose`.
