@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import os
 import re
 import time
@@ -23,47 +22,26 @@ import ibi_rs as ibi
 import numpy as np
 from ibi_rs import metrics
 from peers.contract import CORES
+from scans import EXAMPLES, SCANS, labels
 
 ROOT = Path(__file__).parents[1]
-EXAMPLES = ROOT / "examples"
 RECORD = ROOT / "benchmarks/records/detect.csv"
 PAGE = ROOT / "docs/features.md"
-
-# Scan: folder of the examples or None, folder of all scans, the model's mesh there.
-SCANS = {
-    "tee4": (None, "real_zju_tee", "model_tee_mesh.ply"),
-    "tee6": ("tee", "real_zju_tee", "model_tee_mesh.ply"),
-    "tee10a": (None, "real_zju_tee", "model_tee_mesh.ply"),
-    "tee16": (None, "real_zju_tee", "model_tee_mesh.ply"),
-    "two": ("provete2", "real_provete2", "model_provete2_mesh.ply"),
-    "multi": ("provete2", "real_provete2", "model_provete2_mesh.ply"),
-    "scene": (None, "real_sileane_markers", "model_bunny.ply"),
-}
-COMPLETE = ("tee4", "tee6", "two")
-NAMES = {"scene": "Sileane"}
 
 
 def folders(root: Path | None) -> dict[str, Path]:
     """Where each scan is that can be had."""
-    at = {
-        name: root / of_all if root else EXAMPLES / (shipped or "")
-        for name, (shipped, of_all, _) in SCANS.items()
-        if root or shipped
+    return {
+        name: root / scan.folder if root else EXAMPLES / str(scan.shipped)
+        for name, scan in SCANS.items()
+        if root or scan.shipped
     }
-    return at
-
-
-def labels(folder: Path, name: str) -> np.ndarray:
-    """Return the labelled poses, (K, 4, 4)."""
-    held = json.loads((folder / "gt_pseudo.json").read_text(encoding="utf-8"))
-    instances = held["scenes"][name]["instances"] if "scenes" in held else held["instances"]
-    return np.array([instance["T"] for instance in instances])
 
 
 def run(name: str, folder: Path, repeats: int) -> dict[str, object]:
     """Detect the parts of one scan."""
-    mesh = ibi.io.read_mesh(folder / SCANS[name][2])
-    scan, _ = ibi.io.read_cloud(folder / f"{name}.ply")
+    mesh = ibi.io.read_mesh(folder / SCANS[name].mesh)
+    scan, _ = ibi.io.read_cloud(folder / f"{SCANS[name].file or name}.ply")
     truth = labels(folder, name)
     seconds = []
     for _ in range(repeats):
@@ -78,13 +56,13 @@ def run(name: str, folder: Path, repeats: int) -> dict[str, object]:
     score = metrics.score_scene(found, truth, criterion=metrics.ADD_S, model=model.points)
     of_model, of_match, of_all = np.median(seconds, axis=0)
     return {
-        "scan": NAMES.get(name, name),
+        "scan": name,
         "points": len(scan),
         "correspondences": len(matches.corr),
         "labels": len(truth),
         "reached": score.num_truth_hit,
         "poses": len(found),
-        "precision": f"{score.precision:.3f}" if name in COMPLETE else "",
+        "precision": f"{score.precision:.3f}" if SCANS[name].is_complete else "",
         "model_s": f"{of_model:.3f}",
         "match_s": f"{of_match:.3f}",
         "detect_s": f"{of_all:.3f}",

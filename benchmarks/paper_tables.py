@@ -169,7 +169,7 @@ def run_scene(
             score = metrics.score_scene(poses, scene.poses, criterion=metrics.ADD_S, model=scene.src)
         else:
             score = metrics.score_scene(poses, scene.poses)
-        outcomes.append(Outcome(score, not is_real(data) or key in scans.COMPLETE, seconds))
+        outcomes.append(Outcome(score, not is_real(data) or scans.SCANS[key].is_complete, seconds))
     return outcomes
 
 

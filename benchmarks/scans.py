@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import sys
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,64 @@ from ibi_rs import synth
 from numpy.typing import NDArray
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SHIPPED = {"tee6": "tee", "two": "provete2", "multi": "provete2"}
-# Folder of the scans, voxel in metres, FPFH radius in voxels: those of the examples.
-ALL = {
-    "tee4": ("real_zju_tee", 0.003, 6),
-    "tee6": ("real_zju_tee", 0.003, 6),
-    "tee10a": ("real_zju_tee", 0.003, 6),
-    "two": ("real_provete2", 0.004, 5),
-    "multi": ("real_provete2", 0.004, 5),
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Where a labelled scan lies, and how its matches are made.
+
+    Attributes
+    ----------
+    folder : str
+        In the folder of all scans.
+    mesh : str
+        The model's, there.
+    shipped : str or None
+        In the folder of the examples.
+    voxel, feature_voxels : float
+        Of examples/make_matches.py: metres, and the radius of FPFH in voxels. None: not matched by it.
+    is_complete : bool
+        Whether each part that can be seen has a label: elsewhere a pose without one may well be right.
+    file : str
+        The scan's name there; empty: as here.
+    """
+
+    folder: str
+    mesh: str
+    shipped: str | None = None
+    voxel: float | None = None
+    feature_voxels: float | None = None
+    is_complete: bool = False
+    file: str = ""
+
+
+_TEE = partial(Scan, "real_zju_tee", "model_tee_mesh.ply")
+_BOX = partial(Scan, "real_provete2", "model_provete2_mesh.ply", "provete2", 0.004, 5)
+SCANS = {
+    "tee4": _TEE(None, 0.003, 6, is_complete=True),
+    "tee6": _TEE("tee", 0.003, 6, is_complete=True),
+    "tee10a": _TEE(None, 0.003, 6),
+    "tee16": _TEE(),
+    "two": _BOX(is_complete=True),
+    "multi": _BOX(),
+    "Sileane": Scan("real_sileane_markers", "model_bunny.ply", file="scene"),
 }
-COMPLETE = ("tee4", "tee6", "two")
-"""Scans with a label on each part that can be seen: elsewhere a pose without a label may well be right."""
+ALL = [name for name, scan in SCANS.items() if scan.voxel is not None]
+"""Those that are registered with matches made beforehand."""
+SHIPPED = [name for name in ALL if SCANS[name].shipped is not None]
+
+
+def labels(folder: Path, name: str) -> NDArray[np.float64]:
+    """Return the labelled poses of a scan, (K, 4, 4)."""
+    held = json.loads((folder / "gt_pseudo.json").read_text(encoding="utf-8"))
+    instances = held["scenes"][name]["instances"] if "scenes" in held else held["instances"]
+    return np.array([instance["T"] for instance in instances])
 
 
 @cache
 def shipped_scan(name: str) -> synth.Scene:
     """Read one of the shipped scans."""
-    with np.load(EXAMPLES / SHIPPED[name] / f"{name}.npz") as data:
+    with np.load(EXAMPLES / str(SCANS[name].shipped) / f"{name}.npz") as data:
         return _scene(name, dict(data))
 
 
@@ -43,12 +85,10 @@ def scan(name: str, root: Path) -> synth.Scene:
     sys.path.insert(0, str(EXAMPLES))
     import make_matches as mm
 
-    folder, voxel, radius = ALL[name]
-    where = root / folder
+    where, voxel, radius = root / SCANS[name].folder, SCANS[name].voxel, SCANS[name].feature_voxels
     model = mm.downsampled_model(next(where.glob("model_*_pts.ply")), voxel)
     scene = mm.downsampled_scene(where / f"{name}.ply", voxel)
     corr, similarity = mm.match(mm.fpfh(model, radius * voxel), mm.fpfh(scene, radius * voxel), k=2)
-    labels = json.loads((where / "gt_pseudo.json").read_text(encoding="utf-8"))["scenes"][name]["instances"]
     data = {
         "src": np.asarray(model.points),
         "tgt": np.asarray(scene.points),
@@ -56,7 +96,7 @@ def scan(name: str, root: Path) -> synth.Scene:
         "tgt_normals": np.asarray(scene.normals),
         "corr": corr,
         "similarity": similarity,
-        "poses": np.array([label["T"] for label in labels]),
+        "poses": labels(where, name),
     }
     return _scene(name, data)
 

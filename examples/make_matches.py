@@ -8,7 +8,7 @@ The two sets of the examples, each from the folder of its scans:
     python examples/make_matches.py SCANS/provete2 examples/provete2 --voxel 0.004 --feature-voxels 5
     python examples/make_matches.py SCANS/tee examples/tee --voxel 0.003 --feature-voxels 6 --scenes tee6
 
-Needs Open3D: pip install 'ibi_rs[features]'.
+Needs Open3D: pip install 'ibi_rs[open3d]'.
 """
 
 from __future__ import annotations

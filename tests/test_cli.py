@@ -85,6 +85,7 @@ def test_nothing_found_has_a_code_of_its_own(tmp_path):
         ((MESH, SCAN, "--params", "nowhere.toml"), "nowhere.toml"),
         ((MESH, SCAN, "--voxel", "0"), "voxel is 0"),
         ((MESH, SCAN, "--corr", "nowhere.npy"), "nowhere.npy: cannot be read"),
+        ((MESH, SCAN, "--corr", "corr.npy", "--voxel", "1"), "--corr brings the matches"),
         ((MESH, SCAN, "--from-all-sides"), "viewpoint: give it"),
     ],
 )

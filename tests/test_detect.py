@@ -10,7 +10,7 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import metrics
-from test_features import box, read_ply
+from test_features import box
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 CAMERA = [0, 0, 0]
@@ -21,18 +21,13 @@ def example(name):
     folder = EXAMPLES / ("tee" if name == "tee6" else "provete2")
     with np.load(folder / f"{name}.npz") as file:
         poses = file["poses"]
-    return read_ply(next(folder.glob("model_*_mesh.ply"))), read_scan(folder / f"{name}.ply"), poses
-
-
-def read_scan(path):
-    header, body = path.read_bytes().split(b"end_header\n", 1)
-    assert b"property float x\nproperty float y\nproperty float z" in header
-    return np.frombuffer(body, "<f4").reshape(-1, 3).astype(float)
+    mesh = ibi.io.read_mesh(next(folder.glob("model_*_mesh.ply")))
+    return mesh, ibi.io.read_cloud(folder / f"{name}.ply")[0], poses
 
 
 @pytest.fixture(scope="module")
 def tee():
-    return ibi.Model.from_mesh(*read_ply(EXAMPLES / "tee/model_tee_mesh.ply"))
+    return ibi.Model.from_mesh(*ibi.io.read_mesh(EXAMPLES / "tee/model_tee_mesh.ply"))
 
 
 @pytest.mark.parametrize(("name", "extra"), [("tee6", 0), ("two", 0), ("multi", 2)])

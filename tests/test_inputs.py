@@ -5,7 +5,7 @@ from typing import get_args
 import ibi_rs as ibi
 import numpy as np
 import pytest
-from ibi_rs.params import Ce, Scs, Te
+from ibi_rs.variants import Ce, Scs, Te
 
 SCENE = ibi.synth.outlier_layout(
     0, num_instances=3, num_correspondences=600, outlier_ratio=0.5, num_points=256, num_clutter=200

@@ -10,7 +10,8 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import _core
-from ibi_rs.params import Ce, Hv, Removal, Scs, Te
+from ibi_rs.params import Removal
+from ibi_rs.variants import Ce, Hv, Scs, Te
 
 STAGES = ("scs", "ce", "te", "hv")
 VARIANTS = {name: get_args(union) or (union,) for name, union in zip(STAGES, (Scs, Ce, Te, Hv), strict=True)}
@@ -249,7 +250,7 @@ REFUSED = [
     ({"scs": None}, "params.scs is None; it must be one of Gtm()"),
     ({"ce": "none"}, "params.ce is 'none'; it must be one of 'voting', 'off'"),
     ({"ce": ibi.Gtm()}, "params.ce is Gtm("),
-    ({"te": ibi.Gsac}, "params.te is <class 'ibi_rs.params.Gsac'>; it must be one of Gsac(), "),
+    ({"te": ibi.Gsac}, "params.te is <class 'ibi_rs.variants.Gsac'>; it must be one of Gsac(), "),
     ({"hv": "off"}, "params.hv is 'off'; it must be one of 'evidence', 'overlap', 'inlier_count', 'none'"),
     ({"scs": ibi.Gtm(n_downsample=2)}, "params.scs.n_downsample is 2; it must be at least 3"),
     ({"scs": ibi.Gtm(n_downsample=16385)}, "params.scs.n_downsample is 16385; it must be at most 16384"),

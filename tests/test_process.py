@@ -20,7 +20,7 @@ from typing import get_args
 import ibi_rs as ibi
 import numpy as np
 import pytest
-from ibi_rs.params import Ce, Hv, Scs, Te
+from ibi_rs.variants import Ce, Hv, Scs, Te
 
 LIMIT_S = 30  # for what takes about a second
 

@@ -9,7 +9,8 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import metrics
-from ibi_rs.params import Ce, Hv, Removal, Scs, Te
+from ibi_rs.params import Removal
+from ibi_rs.variants import Ce, Hv, Scs, Te
 
 PLAIN = ibi.Params()
 # The loop of the paper: each accepted hypothesis becomes an instance at once. Fewer correspondences a round

@@ -8,7 +8,9 @@ from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._detect import Matches
 from ibi_rs._match import match
 from ibi_rs._register import Model, register
-from ibi_rs.params import (
+from ibi_rs.params import Params
+from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
+from ibi_rs.variants import (
     Evidence,
     Gsac,
     Gtm,
@@ -21,12 +23,10 @@ from ibi_rs.params import (
     None_,
     Off,
     Overlap,
-    Params,
     Ransac,
     SacCot,
     Voting,
 )
-from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
 
 __all__ = [
     "Evidence",

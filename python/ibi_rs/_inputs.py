@@ -88,12 +88,7 @@ def _correspondences(value: Any) -> npt.NDArray[Any]:
         raise InputError(f"corr has shape {array.shape}; it must be (M, 2) rows or (M, 6) points")
     if array.shape[1] == 6:
         return _aligned(array, np.float64)
-    if not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(f"corr of shape (M, 2) has dtype {array.dtype}; rows must be integers")
-    # Indices beyond int64 are out of any range; clipped, the core still refuses them and says where.
-    if array.dtype == np.uint64:
-        array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
-    return _aligned(array, np.int64)
+    return _indices("corr of shape (M, 2)", array)
 
 
 def _is_rows3(side: Any) -> bool:
@@ -117,3 +112,67 @@ def _num_threads(value: int | None) -> int | None:
     if not is_integer or not 1 <= given <= _MAX_THREADS:
         raise ValueError(f"{name} is {given!r}; it must be an integer from 1 to {_MAX_THREADS}")
     return int(given)
+
+
+def _optional(name: str, value: Any) -> npt.NDArray[np.float64] | None:
+    return None if value is None else _points(name, value)
+
+
+def _number(name: str, value: Any) -> float:
+    array = _real(name, value)
+    if array.shape != ():
+        raise TypeError(f"{name} has shape {array.shape}; it must be a number")
+    return float(array)
+
+
+def _count(name: str, value: Any, least: int) -> int:
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
+        raise TypeError(f"{name} must be an integer, not {type(value).__name__}")
+    if not least <= value < 2**32:
+        raise InputError(f"{name} is {value}; it must be at least {least} and below 2^32")
+    return int(value)
+
+
+def _seed(value: Any) -> int:
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
+        raise TypeError(f"seed must be an integer, not {type(value).__name__}")
+    if not 0 <= value < 2**64:
+        raise InputError(f"seed is {value}; it must be from 0 to 2^64 - 1")
+    return int(value)
+
+
+def _rows(name: str, value: Any) -> npt.NDArray[np.int64]:
+    array = _real(name, value)
+    if array.shape == (0,):
+        return np.empty(0, np.int64)
+    if array.ndim != 1:
+        raise InputError(f"{name} has shape {array.shape}; it must be (K,)")
+    return _indices(name, array)
+
+
+def _faces(value: Any) -> npt.NDArray[np.int64]:
+    array = _real("faces", value)
+    if array.shape == (0,):
+        return np.empty((0, 3), np.int64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"faces has shape {array.shape}; it must be (F, 3)")
+    return _indices("faces", array)
+
+
+def _indices(name: str, array: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    if not np.issubdtype(array.dtype, np.integer):
+        raise TypeError(f"{name} has dtype {array.dtype}; rows must be integers")
+    return _int64(array)
+
+
+def _int64(array: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Any integers; what is beyond int64 is clipped, is still no row, and is refused with its place."""
+    if array.dtype == np.uint64:
+        array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
+    return _aligned(array, np.int64)
+
+
+def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Make an array read-only; return it."""
+    array.flags.writeable = False
+    return array

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._inputs import _aligned, _num_threads, _real
-from ibi_rs.features import _count, _number
+from ibi_rs._inputs import _aligned, _count, _num_threads, _number, _real
 
 
 def match(

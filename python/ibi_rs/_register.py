@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs import _core, _detect, features
+from ibi_rs import _core, _detect
 from ibi_rs._detect import Matches
 from ibi_rs._inputs import (
     Points,
     _correspondences,
+    _faces,
     _frames,
+    _frozen,
     _num_threads,
+    _number,
     _points,
     _vector,
     _viewpoint,
@@ -174,8 +177,9 @@ class Model:
         axes = None if frames is None else _frames("src_frames", frames)
         self._source = _core.Source(points, of_points, axes)
         # Copies: the caller's arrays may change, the prepared source does not.
-        self._points, self._normals = _frozen(points), None if of_points is None else _frozen(of_points)
-        self._frames = None if axes is None else _frozen(axes)
+        self._points = _frozen(points.copy())
+        self._normals = None if of_points is None else _frozen(of_points.copy())
+        self._frames = None if axes is None else _frozen(axes.copy())
         self._voxel = _detect.VOXELS_PER_SPACING * self.spacing
 
     @classmethod
@@ -232,10 +236,10 @@ class Model:
             if faces is None or len(faces) == 0:
                 raise _core.InputError("faces: the mesh has none; a cloud goes to Model(src, normals=...)")
         if voxel is not None:
-            voxel = features._number("voxel", voxel)
+            voxel = _number("voxel", voxel)
             if not 0 < voxel < math.inf:
                 raise _core.InputError(f"voxel is {voxel:g}; it must be above 0 and finite")
-        mesh = _points("vertices", vertices), features._faces(faces)
+        mesh = _points("vertices", vertices), _faces(faces)
         points, normals, voxel = _detect.mesh_points(*mesh, voxel, num_threads)
         model = cls(points, normals=normals)
         model._voxel = voxel
@@ -455,12 +459,6 @@ class Model:
             **({} if run is None else {name: run.stage(name, stage) for name, stage in own.items()}),
         )
         return _registration(raw, params)
-
-
-def _frozen(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    copy = array.copy()
-    copy.flags.writeable = False
-    return copy
 
 
 def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:

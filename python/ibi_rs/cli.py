@@ -68,9 +68,12 @@ def register(
     voxel: Annotated[
         float | None, typer.Option(help="Spacing of what is looked at. Default: 1/24 of the model.")
     ] = None,
-    table: Annotated[
+    remove_plane: Annotated[
         bool | None,
-        typer.Option("--table/--no-table", help="Take away a table, or keep all. Default: if seen."),
+        typer.Option(
+            "--remove-plane/--keep-plane",
+            help="Take the largest plane away, or not. Default: if it looks like a table.",
+        ),
     ] = None,
     preset: Annotated[
         str | None, typer.Option(help=f"{', '.join(PRESETS)}; by default what fits the scene.")
@@ -94,6 +97,8 @@ def register(
     With your own matches:         ibi register part.npy scan.npy --corr matches.npy
     """
     start = time.perf_counter()
+    if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
+        _fail("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
     chosen = _params(preset, params)
     options: dict[str, Any] = {"max_instances": max_instances, "timeout_s": timeout_s, "num_threads": threads}
     try:
@@ -113,7 +118,7 @@ def register(
                     chosen,
                     tgt_normals=tgt_normals if from_all_sides else None,
                     viewpoint=None if from_all_sides else viewpoint,
-                    remove_plane=table,
+                    remove_plane=remove_plane,
                     callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
                     **options,
                 )

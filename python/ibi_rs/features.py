@@ -10,13 +10,23 @@ Lengths are in the unit of the data.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._inputs import Points, _aligned, _num_threads, _points, _real, _viewpoint
+from ibi_rs._inputs import (
+    Points,
+    _count,
+    _faces,
+    _num_threads,
+    _number,
+    _optional,
+    _points,
+    _rows,
+    _seed,
+    _viewpoint,
+)
 
 __all__ = [
     "Plane",
@@ -440,56 +450,3 @@ def outer_surface(
         None if lift is None else _number("lift", lift),
         _num_threads(num_threads),
     )
-
-
-def _optional(name: str, value: Any) -> npt.NDArray[np.float64] | None:
-    return None if value is None else _points(name, value)
-
-
-def _number(name: str, value: Any) -> float:
-    array = _real(name, value)
-    if array.shape != ():
-        raise TypeError(f"{name} has shape {array.shape}; it must be a number")
-    return float(array)
-
-
-def _count(name: str, value: Any, least: int) -> int:
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
-        raise TypeError(f"{name} must be an integer, not {type(value).__name__}")
-    if not least <= value < 2**32:
-        raise _core.InputError(f"{name} is {value}; it must be at least {least} and below 2^32")
-    return int(value)
-
-
-def _seed(value: Any) -> int:
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
-        raise TypeError(f"seed must be an integer, not {type(value).__name__}")
-    if not 0 <= value < 2**64:
-        raise _core.InputError(f"seed is {value}; it must be from 0 to 2^64 - 1")
-    return int(value)
-
-
-def _rows(name: str, value: Any) -> npt.NDArray[np.int64]:
-    array = _real(name, value)
-    if array.shape == (0,):
-        return np.empty(0, np.int64)
-    if array.ndim != 1:
-        raise _core.InputError(f"{name} has shape {array.shape}; it must be (K,)")
-    return _indices(name, array)
-
-
-def _faces(value: Any) -> npt.NDArray[np.int64]:
-    array = _real("faces", value)
-    if array.shape == (0,):
-        return np.empty((0, 3), np.int64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise _core.InputError(f"faces has shape {array.shape}; it must be (F, 3)")
-    return _indices("faces", array)
-
-
-def _indices(name: str, array: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    if not np.issubdtype(array.dtype, np.integer):
-        raise TypeError(f"{name} has dtype {array.dtype}; rows must be integers")
-    if array.dtype == np.uint64:  # beyond int64 is beyond any row
-        array = np.minimum(array, np.uint64(np.iinfo(np.int64).max))
-    return _aligned(array, np.int64)

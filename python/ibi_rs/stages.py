@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
+from ibi_rs._inputs import _frozen, _int64
 
 __all__ = [
     "Enhance",
@@ -222,11 +223,6 @@ class _Refused(Exception):
     """An answer that cannot be used; the message says what it is."""
 
 
-def _frozen(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    array.flags.writeable = False
-    return array
-
-
 def _numbers(what: str, value: Any, kinds: str, ndim: int) -> npt.NDArray[Any]:
     """Any array of so many dimensions, of real numbers or of integers."""
     try:
@@ -252,9 +248,7 @@ def _picked(
     if given is None:
         raise _Refused("None")
     ids = _numbers("ids", given, "iu", 1)
-    if ids.dtype == np.uint64:  # what is beyond int64 stays out of range
-        ids = np.minimum(ids, np.uint64(np.iinfo(np.int64).max))
-    ids = np.ascontiguousarray(ids, np.int64)
+    ids = _int64(ids)
     at = np.searchsorted(alive, ids)
     is_alive = alive[np.minimum(at, len(alive) - 1)] == ids if len(alive) else np.zeros(len(ids), bool)
     if not is_alive.all():

@@ -22,6 +22,7 @@
 //! With the feature `rayon` (default) kernels run on a thread pool of the registrar's own; `serde` makes
 //! parameters and results plain data.
 
+mod checks;
 mod claims;
 mod correspondence;
 mod error;

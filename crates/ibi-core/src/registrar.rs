@@ -164,9 +164,9 @@ impl<'a> Registrar<'a> {
     /// Checks parameters and input, builds what all rounds share.
     ///
     /// # Errors
-    /// If a parameter is out of range; if the seed selection needs a similarity and there is none; if the target is as bad
-    /// as a source may be (see [`Self::new`]); if a correspondence points outside of a cloud; if only one cloud has normals or frames; if the clouds cannot be in the
-    /// same unit; if the threads cannot be started.
+    /// If a parameter is out of range; if the seed selection needs an argument that is not given; if the target is as
+    /// bad as a source may be (see [`Self::new`]); if a correspondence points outside of a cloud; if only one cloud has
+    /// normals or frames; if the clouds cannot be in the same unit; if the threads cannot be started.
     pub fn begin<'s>(
         &'s self,
         target: &Cloud<'s>,
@@ -174,8 +174,10 @@ impl<'a> Registrar<'a> {
     ) -> Result<State<'s>, Error> {
         let start = Instant::now();
         self.params.validate()?;
-        if self.scs().needs() == Some(Argument::Similarity) && !correspondences.has_similarity() {
-            return Err(Error::Missing { argument: Argument::Similarity });
+        if let Some(argument) = self.scs().needs()
+            && !self.is_given(argument, target, correspondences)
+        {
+            return Err(Error::Missing { argument });
         }
         let pool = Arc::new(Pool::new(self.num_threads)?);
         let (scene, pairs) = pool.install(|| {
@@ -187,6 +189,19 @@ impl<'a> Registrar<'a> {
         })?;
         let interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
         Ok(State::new(Problem::new(scene, pairs, interrupt), pool, start))
+    }
+
+    /// Whether an optional argument is there; the others always are.
+    fn is_given(&self, argument: Argument, target: &Cloud<'_>, correspondences: &Correspondences) -> bool {
+        match argument {
+            Argument::SrcNormals => self.source.normals.is_some(),
+            Argument::TgtNormals => target.normals.is_some(),
+            Argument::SrcFrames => self.source.frames.is_some(),
+            Argument::TgtFrames => target.frames.is_some(),
+            Argument::Similarity => correspondences.has_similarity(),
+            Argument::Viewpoint => target.viewpoint.is_some(),
+            Argument::Src | Argument::Tgt | Argument::Corr => true,
+        }
     }
 
     /// Plays rounds until one of them ends the run, or the observer does.

@@ -5,6 +5,7 @@ use std::sync::OnceLock;
 
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
+use crate::checks::{first_not_finite, unit_vectors};
 use crate::error::{Argument, Error};
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::{Nearby, mean_spacing};
@@ -375,13 +376,13 @@ impl Scene<'_> {
 /// Enough to know the fit by chance to a hundredth.
 const CHANCE_SAMPLES: usize = 1000;
 
-/// Above this a square is no longer finite in `f64`, whatever it is multiplied with.
-const MAX_COORDINATE: f64 = 1e100;
-
 pub(crate) fn check_points(points: &[Point3<f64>], argument: Argument) -> Result<(), Error> {
-    let bad = |p: &Point3<f64>| !p.iter().all(|x| x.abs() < MAX_COORDINATE); // catches NaN too
-    match points.iter().position(bad) {
-        Some(row) => Err(Error::NotFinite { argument, row, value: points[row].coords.into() }),
+    check_finite(points.iter().map(|p| p.coords), argument)
+}
+
+fn check_finite(rows: impl Iterator<Item = Vector3<f64>>, argument: Argument) -> Result<(), Error> {
+    match first_not_finite(rows) {
+        Some((row, value)) => Err(Error::NotFinite { argument, row, value }),
         None => Ok(()),
     }
 }
@@ -395,13 +396,8 @@ fn normalised(
     if rows.len() != expected {
         return Err(Error::LengthMismatch { argument, len: rows.len(), of, expected });
     }
-    let unit = |(row, n): (usize, &Vector3<f64>)| {
-        if !n.iter().all(|x| x.abs() < MAX_COORDINATE) {
-            return Err(Error::NotFinite { argument, row, value: (*n).into() });
-        }
-        n.try_normalize(0.0).ok_or(Error::ZeroNormal { argument, row })
-    };
-    rows.iter().enumerate().map(unit).collect()
+    check_finite(rows.iter().copied(), argument)?;
+    unit_vectors(rows).map_err(|row| Error::ZeroNormal { argument, row })
 }
 
 /// How far the axes of a frame may be from orthonormal: frames may come from single precision.

@@ -2,7 +2,7 @@
 
 `outlier_layout` mixes true pairs with random outliers; `ecc_layout` matches noisy descriptors of clean
 shapes: your own, or FPFH; `fpfh_layout` matches FPFH of the target as it is. For FPFH they need Open3D
-(``pip install 'ibi_rs[features]'``). Lengths are in radii of the source shape, which lies in the unit sphere.
+(``pip install 'ibi_rs[open3d]'``). Lengths are in radii of the source shape, which lies in the unit sphere.
 This package imports nothing else of `ibi_rs`.
 
 Examples

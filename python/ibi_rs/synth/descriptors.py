@@ -23,7 +23,7 @@ def load_open3d() -> Any:
     try:
         import open3d
     except ImportError as error:  # also when it is installed and one of its system libraries is not
-        message = f"FPFH descriptors need Open3D: pip install 'ibi_rs[features]' ({error})"
+        message = f"FPFH descriptors need Open3D: pip install 'ibi_rs[open3d]' ({error})"
         raise ImportError(message) from error
     return open3d
 

@@ -3,9 +3,7 @@
 use nalgebra::{Point3, Vector3};
 
 use super::FeatureError;
-
-/// Above this a square is no longer finite in `f64`, whatever it is multiplied with.
-const MAX_COORDINATE: f64 = 1e100;
+use crate::checks::{MAX_COORDINATE, first_not_finite, unit_vectors};
 
 /// No more rows than 32-bit ids can name, all of them finite.
 pub(super) fn check_points(argument: &'static str, points: &[Point3<f64>]) -> Result<(), FeatureError> {
@@ -24,11 +22,12 @@ pub(super) fn check_place(argument: &'static str, place: Option<&Point3<f64>>) -
 
 fn check_finite(
     argument: &'static str,
-    mut rows: impl Iterator<Item = Vector3<f64>>,
+    rows: impl Iterator<Item = Vector3<f64>>,
 ) -> Result<(), FeatureError> {
-    let bad = |v: &Vector3<f64>| !v.iter().all(|x| x.abs() < MAX_COORDINATE); // catches NaN too
-    let found = rows.by_ref().enumerate().find(|(_, v)| bad(v));
-    found.map_or(Ok(()), |(row, v)| Err(FeatureError::NotFinite { argument, row, value: v.into() }))
+    match first_not_finite(rows) {
+        Some((row, value)) => Err(FeatureError::NotFinite { argument, row, value }),
+        None => Ok(()),
+    }
 }
 
 /// One normal of length 1 for each of `points`.
@@ -41,10 +40,7 @@ pub(super) fn unit_normals(
         return Err(FeatureError::LengthMismatch { argument, len: normals.len(), of: "points", expected });
     }
     check_finite(argument, normals.iter().copied())?;
-    let unit = |(row, n): (usize, &Vector3<f64>)| {
-        n.try_normalize(0.0).ok_or(FeatureError::ZeroNormal { argument, row })
-    };
-    normals.iter().enumerate().map(unit).collect()
+    unit_vectors(normals).map_err(|row| FeatureError::ZeroNormal { argument, row })
 }
 
 /// A length that must be more than 0.

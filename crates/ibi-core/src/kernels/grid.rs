@@ -89,23 +89,10 @@ impl Grid {
 
     /// Ranges of [`Self::order`], ascending, that hold every point within `radius` of `place`, and others.
     pub fn around(&self, place: [f32; 3], radius: f32) -> impl Iterator<Item = Range<usize>> + '_ {
-        // A little more than the radius: rounding must not lose a point at its very end.
-        let radius = radius + 1e-4 * radius + 1e-6 * place.iter().fold(0.0, |a: f32, x| a.max(x.abs()));
-        let low = self.cell(place.map(|x| x - radius));
-        let high = self.cell(place.map(|x| x + radius));
+        let (radius, low, high) = self.ball(place, radius);
         (low[0]..=high[0]).flat_map(move |x| {
             let dx = self.gap(0, x, place[0]);
-            (low[1]..=high[1]).filter_map(move |y| {
-                let dy = self.gap(1, y, place[1]);
-                let left = radius * radius - dx * dx - dy * dy;
-                if left < 0.0 {
-                    return None;
-                }
-                let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
-                let first = self.along(2, place[2] - reach);
-                let last = self.along(2, place[2] + reach);
-                Some(self.starts[row + first] as usize..self.starts[row + last + 1] as usize)
-            })
+            (low[1]..=high[1]).filter_map(move |y| self.column([x, y], dx, place, radius))
         })
     }
 
@@ -113,21 +100,36 @@ impl Grid {
     #[inline(always)]
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn each_around(&self, place: [f32; 3], radius: f32, mut look: impl FnMut(Range<usize>)) {
-        let radius = radius + 1e-4 * radius + 1e-6 * place.iter().fold(0.0, |a: f32, x| a.max(x.abs()));
-        let low = self.cell(place.map(|x| x - radius));
-        let high = self.cell(place.map(|x| x + radius));
+        let (radius, low, high) = self.ball(place, radius);
         for x in low[0]..=high[0] {
             let dx = self.gap(0, x, place[0]);
             for y in low[1]..=high[1] {
-                let dy = self.gap(1, y, place[1]);
-                let left = radius * radius - dx * dx - dy * dy;
-                if left >= 0.0 {
-                    let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
-                    let (first, last) = (self.along(2, place[2] - reach), self.along(2, place[2] + reach));
-                    look(self.starts[row + first] as usize..self.starts[row + last + 1] as usize);
+                if let Some(run) = self.column([x, y], dx, place, radius) {
+                    look(run);
                 }
             }
         }
+    }
+
+    /// The radius, the first and the last cell of a ball. A little more than was asked for: rounding must not lose a point
+    /// at its very end.
+    #[inline]
+    fn ball(&self, place: [f32; 3], radius: f32) -> (f32, [usize; 3], [usize; 3]) {
+        let radius = radius + 1e-4 * radius + 1e-6 * place.iter().fold(0.0, |a: f32, x| a.max(x.abs()));
+        (radius, self.cell(place.map(|x| x - radius)), self.cell(place.map(|x| x + radius)))
+    }
+
+    /// The part of a column of cells that a ball meets, `dx` away from it on the first axis.
+    #[inline]
+    fn column(&self, [x, y]: [usize; 2], dx: f32, place: [f32; 3], radius: f32) -> Option<Range<usize>> {
+        let dy = self.gap(1, y, place[1]);
+        let left = radius * radius - dx * dx - dy * dy;
+        if left < 0.0 {
+            return None;
+        }
+        let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
+        let (first, last) = (self.along(2, place[2] - reach), self.along(2, place[2] + reach));
+        Some(self.starts[row + first] as usize..self.starts[row + last + 1] as usize)
     }
 
     /// For each cell that holds points: its range of [`Self::order`], and, ascending, those that hold every point within

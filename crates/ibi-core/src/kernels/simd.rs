@@ -3,7 +3,6 @@
 //! A wheel must run on every machine of its architecture, so the crate is compiled for the oldest one. A loop inside
 //! [`simd`] is compiled a second and a third time for newer vector units (AVX2, AVX-512), and the best copy that the
 //! processor has is taken. Nothing is computed in another order or fused, so the bits stay the same.
-
 //!
 //! Where the compiler does not see the vectors by itself, a loop is written with those of [`Simd`], as the
 //! [`WithSimd`] of a type, and run by [`dispatch`].
