@@ -25,6 +25,7 @@ use ibi_core::kernels::otsu::otsu;
 use ibi_core::kernels::overlap::{Contact, Surface, overlap, places};
 use ibi_core::kernels::replicator::{Payoffs, replicator};
 use ibi_core::kernels::triplets::TopTriplets;
+use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::stages::ce::Ce;
 use ibi_core::stages::hv::Hv;
 use ibi_core::stages::scs::{Gtm, Scs};
@@ -232,8 +233,20 @@ fn kernels(c: &mut Criterion) {
             b.iter(|| Nearby::new(black_box(&scene.target), 0.3));
         });
         assert_eq!(near.nearest(&scene.target[7]), Some(7));
-        group.bench_function(BenchmarkId::new("nearby_query", scene.target.len()), |b| {
-            b.iter(|| near.nearest(black_box(&source[0])));
+        // As in a run: many in a row, each elsewhere. Half of them have a neighbour within half of the reach.
+        let queries = scene.target.iter().step_by(10).enumerate().map(|(i, p)| {
+            let off = if i % 2 == 0 { 0.02 } else { 0.25 };
+            (i, p + Vector3::new(off, -off, off))
+        });
+        let queries: Vec<(usize, Point3<f64>)> = queries.collect();
+        group.bench_function(BenchmarkId::new("nearby_queries", queries.len()), |b| {
+            b.iter(|| {
+                let mut found = 0;
+                near.nearest_each(0.3, queries.iter().copied(), |_, _, row| {
+                    found += usize::from(row.is_some())
+                });
+                black_box(found)
+            });
         });
         let spacing = mean_spacing(&scene.target);
         assert!(spacing > 0.0);
