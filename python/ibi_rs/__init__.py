@@ -4,6 +4,7 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 """
 
 from ibi_rs import features, io, metrics, plot, stages, synth
+from ibi_rs._batch import Job, JobError, RayExecutor, register_batch
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._detect import Matches
 from ibi_rs._match import match
@@ -36,6 +37,8 @@ __all__ = [
     "InlierCount",
     "InputError",
     "Irls",
+    "Job",
+    "JobError",
     "LocalGtm",
     "Mac",
     "Matches",
@@ -48,6 +51,7 @@ __all__ = [
     "ParamsError",
     "Pose",
     "Ransac",
+    "RayExecutor",
     "Registration",
     "Round",
     "SacCot",
@@ -62,6 +66,7 @@ __all__ = [
     "metrics",
     "plot",
     "register",
+    "register_batch",
     "stages",
     "synth",
 ]

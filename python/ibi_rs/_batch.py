@@ -1,0 +1,549 @@
+"""`register_batch`: many scenes, each a job that any executor can run."""
+
+from __future__ import annotations
+
+import functools
+import operator
+import os
+import pickle
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy.typing as npt
+
+from ibi_rs import io
+from ibi_rs._core import InputError, ParamsError
+from ibi_rs._inputs import Points, _count, _num_threads
+from ibi_rs._register import Model
+from ibi_rs.params import Params
+from ibi_rs.registration import Registration, Round
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+_WINDOW = 64
+"""Jobs under way in an executor whose workers cannot be counted."""
+_TICK_S = 0.5
+"""A wait without an end would not see Ctrl-C on Windows."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Job:
+    """One scene and the model to be found in it: what :func:`register_batch` runs, here or elsewhere.
+
+    With ``corr`` it is ``model.register(tgt, corr, ...)``, without ``model.detect(tgt, ...)``. It can be
+    pickled; jobs that arrive in one process share one model, which is described there once.
+
+    Parameters
+    ----------
+    model : Model
+        To be found.
+    tgt : (N, 3) array_like, or path
+        The scene, as in :func:`register`; or a file, which :func:`ibi_rs.io.read_cloud` reads where the job
+        runs. The normals in it count where ``corr``, ``tgt_normals`` and ``viewpoint`` are left out.
+    corr : optional
+        Correspondences, as in :func:`register`.
+    params, tgt_normals, viewpoint, max_instances, timeout_s : optional
+        As in :func:`register` and :meth:`Model.detect`.
+    tgt_frames, similarity : optional
+        As in :func:`register`; only with ``corr``.
+    remove_plane : bool, optional
+        As in :meth:`Model.detect`; only without ``corr``.
+    num_threads : int, optional
+        Default: what the batch gives each of its jobs.
+    name : str, optional
+        What errors call the job, beside its index. Default: the path, if ``tgt`` is one.
+
+    Raises
+    ------
+    InputError
+        An argument is given that has no say, with ``corr`` or without.
+    TypeError
+        ``model`` is no :class:`Model`. All else is looked at when the job runs.
+
+    Examples
+    --------
+    >>> import ibi_rs as ibi
+    >>> scene = ibi.synth.outlier_layout(seed=1, num_instances=5)
+    >>> job = ibi.Job(ibi.Model(scene.src), scene.tgt, scene.corr, max_instances=2)
+    >>> len(job.run())
+    2
+    """
+
+    model: Model
+    tgt: Points
+    corr: Any = None
+    params: Params | None = None
+    _: KW_ONLY
+    tgt_normals: npt.ArrayLike | None = None
+    tgt_frames: npt.ArrayLike | None = None
+    similarity: npt.ArrayLike | None = None
+    viewpoint: npt.ArrayLike | None = None
+    remove_plane: bool | None = None
+    num_threads: int | None = None
+    max_instances: int | None = None
+    timeout_s: float | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.model, Model):
+            raise TypeError(f"model must be ibi_rs.Model, not {type(self.model).__name__}")
+        idle = ("tgt_frames", "similarity") if self.corr is None else ("remove_plane",)
+        for name in idle:
+            if getattr(self, name) is not None:
+                word = "without" if self.corr is None else "with"
+                raise InputError(f"{name} has no say {word} corr; leave it out")
+
+    @property
+    def path(self) -> Path | None:
+        """The file that ``tgt`` is read from; None for arrays."""
+        return Path(self.tgt) if isinstance(self.tgt, (str, os.PathLike)) else None
+
+    def run(
+        self, *, num_threads: int | None = None, callback: Callable[[Round], object] | None = None
+    ) -> Registration:
+        """Read the scene if it is a file, and find the model in it.
+
+        Parameters
+        ----------
+        num_threads : int, optional
+            As in :func:`register`; the job's own comes first.
+        callback : callable, optional
+            As in :func:`register`.
+
+        Returns
+        -------
+        Registration
+
+        Raises
+        ------
+        InputError, ParamsError, TypeError, ValueError
+            Those of :func:`register`, :meth:`Model.detect` and :func:`ibi_rs.io.read_cloud`.
+        """
+        tgt, tgt_normals = self.tgt, self.tgt_normals
+        if self.path is not None:
+            tgt, normals = io.read_cloud(self.path)
+            if self.corr is None and tgt_normals is None and self.viewpoint is None:
+                tgt_normals = normals
+        options: dict[str, Any] = {
+            "tgt_normals": tgt_normals,
+            "viewpoint": self.viewpoint,
+            "num_threads": self.num_threads if self.num_threads is not None else num_threads,
+            "max_instances": self.max_instances,
+            "timeout_s": self.timeout_s,
+            "callback": callback,
+        }
+        if self.corr is None:
+            return self.model.detect(tgt, self.params, remove_plane=self.remove_plane, **options)
+        options |= {"tgt_frames": self.tgt_frames, "similarity": self.similarity}
+        return self.model.register(tgt, self.corr, self.params, **options)
+
+    def __repr__(self) -> str:
+        scene = self.name or self.path or type(self.tgt).__name__
+        return f"Job({scene}, {self.model!r})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"model": _dumped(self.model)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state | {"model": _loaded(state["model"])})
+
+
+_dumps: weakref.WeakKeyDictionary[Model, bytes] = weakref.WeakKeyDictionary()
+
+
+def _dumped(model: Model) -> bytes:
+    """Pickle a model once for all jobs with it."""
+    if model not in _dumps:
+        _dumps[model] = pickle.dumps(model)
+    return _dumps[model]
+
+
+@functools.lru_cache(maxsize=8)
+def _loaded(data: bytes) -> Model:
+    """One model for all jobs of a process: its spacing is measured and its features are found once."""
+    model = pickle.loads(data)
+    assert isinstance(model, Model)
+    return model
+
+
+class JobError(Exception):
+    """What stands in the place of the result of a job that failed.
+
+    Attributes
+    ----------
+    index : int
+        Which job, from 0.
+    name : str or None
+        Its name.
+    error : Exception
+        What went wrong: what ``job.run()`` raised, or the executor in its stead.
+    """
+
+    def __init__(self, index: int, name: str | None, error: Exception) -> None:
+        super().__init__(index, name, error)  # so it can be pickled
+        self.index, self.name, self.error = index, name, error
+        self.__cause__ = error
+
+    def __str__(self) -> str:
+        lines = str(self.error).strip().splitlines()
+        text = lines[0] if lines else ""
+        if not text or not isinstance(self.error, (InputError, ParamsError, ImportError, OSError)):
+            text = f"{type(self.error).__name__}: {text}".removesuffix(": ")
+        # Errors of a file name it themselves.
+        name = f", {self.name}" if self.name and self.name not in text else ""
+        return f"job {self.index}{name}: {text}"
+
+
+def register_batch(
+    jobs: Iterable[Job],
+    executor: Executor | Callable[[], Executor] | None = None,
+    *,
+    num_threads: int | None = None,
+    window: int | None = None,
+    retries: int = 1,
+    callback: Callable[[int, Registration | JobError], object] | None = None,
+) -> Iterator[Registration | JobError]:
+    """Run many jobs at a time; give their results one by one, in the order of the jobs.
+
+    Each result has the same bits as ``job.run()``, wherever it was made. Work begins with the first result
+    that is asked for: iterate, or take ``list(register_batch(jobs))``.
+
+    Parameters
+    ----------
+    jobs : iterable of Job
+        A list, or a generator, which is asked for no more than ``window`` jobs ahead of the results.
+    executor : Executor, or callable that makes one, optional
+        Where the jobs run. Default: threads of this process. An executor is left as it is; one that the
+        callable makes is shut down at the end, and made anew if a worker's death breaks it. Dask:
+        ``client.get_executor()``; Ray: :class:`RayExecutor`.
+    num_threads : int, optional
+        Of each job that does not say itself. Default: in threads of this process what shares the cores among
+        the jobs (``IBI_NUM_THREADS``, else those the process may use), in an executor 1, as the executor has
+        the workers.
+    window : int, optional
+        Jobs that are under way, or done and not given yet, at a time. Default: in threads of this process two
+        for each, in an executor 64; should be twice its workers or more.
+    retries : int, optional
+        How often a job whose worker has died is run again, on executors that the callable makes. All jobs
+        under way when it died are run again, one at a time; only one that breaks the executor on its own
+        counts as failed. Dask and Ray do so by their own settings.
+    callback : callable, optional
+        Called with the job's index and its result as soon as a job ends, in any order; in the thread that
+        asks for results.
+
+    Yields
+    ------
+    Registration or JobError
+        An error is a value in its place, and no other job is the worse for it.
+
+    Returns
+    -------
+    iterator
+        Ctrl-C, or closing it, ends the batch. Jobs that wait are dropped; those under way end within a round
+        in threads of this process, at once in processes that the callable made, elsewhere when they are
+        done.
+
+    Raises
+    ------
+    TypeError, InputError
+        An argument is of another type or value than above. After the results of the jobs before: something
+        in ``jobs`` is no :class:`Job`, or what the iterable itself raises.
+    ValueError
+        ``num_threads`` or ``IBI_NUM_THREADS`` is no integer from 1 to 65535.
+
+    Examples
+    --------
+    >>> import ibi_rs as ibi
+    >>> scene = ibi.synth.outlier_layout(seed=1, num_instances=5)
+    >>> model = ibi.Model(scene.src)
+    >>> jobs = [ibi.Job(model, scene.tgt, scene.corr), ibi.Job(model, scene.tgt[:1], scene.corr, name="cut")]
+    >>> for found in ibi.register_batch(jobs):
+    ...     print(found if isinstance(found, ibi.JobError) else len(found))
+    5
+    job 1, cut: tgt has 1 points; at least 3 are needed
+    """
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be callable, not {type(callback).__name__}")
+    threads = None if num_threads is None else _num_threads(num_threads)
+    stop = threading.Event()
+    make: Callable[[], Executor]
+    if executor is None:
+        workers, threads = _share(_cores(), operator.length_hint(jobs, 2**31), threads)
+        make, default = functools.partial(ThreadPoolExecutor, workers, "ibi-batch"), 2 * workers
+        call = functools.partial(_run, num_threads=threads, stop=stop)
+    else:
+        if isinstance(executor, Executor):
+            make = functools.partial(_given, executor)
+        elif callable(executor):
+            make = executor
+        else:
+            raise TypeError(
+                "executor must be a concurrent.futures.Executor (of Dask client.get_executor(), of Ray "
+                f"ibi_rs.RayExecutor()) or a callable that makes one, not {type(executor).__name__}"
+            )
+        default = _WINDOW
+        call = functools.partial(_run, num_threads=threads or 1)
+    return iter(
+        _Batch(
+            call,
+            _checked(jobs),
+            make,
+            is_ours=not isinstance(executor, Executor),
+            window=default if window is None else _count("window", window, 1),
+            retries=_count("retries", retries, 0),
+            callback=callback,
+            stop=stop,
+        )
+    )
+
+
+def _given(executor: Executor) -> Executor:
+    return executor
+
+
+def _run(job: Job, num_threads: int | None, stop: threading.Event | None = None) -> Registration:
+    # In a thread Ctrl-C is not seen: the callback ends the run.
+    callback = None if stop is None else lambda _round: not stop.is_set()
+    return job.run(num_threads=num_threads, callback=callback)
+
+
+def _checked(jobs: Iterable[Job]) -> Iterator[Job]:
+    for index, job in enumerate(jobs):
+        if not isinstance(job, Job):
+            raise TypeError(f"jobs[{index}] must be ibi_rs.Job, not {type(job).__name__}")
+        yield job
+
+
+def _cores() -> int:
+    """How many threads there should be: by IBI_NUM_THREADS, the process's mask and its container's quota."""
+    if (given := _num_threads(None)) is not None:
+        return given
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        cores = min(cores, max(1, int(quota) // int(period)))
+    except (OSError, ValueError):  # there is none, or it is "max"
+        pass
+    return cores
+
+
+def _terminate(executor: Executor) -> None:
+    """End worker processes at once, which would take up the jobs that they have been sent."""
+    if hasattr(executor, "terminate_workers"):  # Python 3.14
+        executor.terminate_workers()
+    else:
+        for process in list((getattr(executor, "_processes", None) or {}).values()):
+            process.terminate()
+
+
+def _share(cores: int, num_jobs: int, num_threads: int | None) -> tuple[int, int]:
+    """Jobs at a time, and threads of each."""
+    workers = max(1, min(num_jobs, cores // (num_threads or 1)))
+    return workers, num_threads or max(1, cores // workers)
+
+
+@dataclass
+class _Task(Generic[_T]):
+    index: int
+    item: _T
+    is_suspect: bool = False
+    """It was under way when a worker died, and is run alone now."""
+    num_crashes: int = 0
+    """How often a worker died when it ran alone."""
+
+
+class _Batch(Generic[_T, _R]):
+    """One call for each item, on an executor, results in order, within a window."""
+
+    def __init__(
+        self,
+        call: Callable[[_T], _R],
+        items: Iterable[_T],
+        make: Callable[[], Executor],
+        *,
+        is_ours: bool,
+        window: int,
+        retries: int = 1,
+        callback: Callable[[int, _R | JobError], object] | None = None,
+        stop: threading.Event | None = None,
+    ) -> None:
+        self._call, self._items, self._make, self._is_ours = call, iter(items), make, is_ours
+        self._window, self._retries, self._callback, self._stop = window, retries, callback, stop
+        self._num_taken = 0
+        self._is_empty = False
+        self._failure: Exception | None = None  # of the iterable itself
+        self._running: dict[Future[_R], _Task[_T]] = {}
+        self._suspects: deque[_Task[_T]] = deque()
+        self._done: dict[int, _R | JobError] = {}
+
+    def __iter__(self) -> Iterator[_R | JobError]:
+        self._executor = self._make()
+        turn = 0
+        try:
+            while True:
+                self._fill()
+                if turn in self._done:
+                    yield self._done.pop(turn)
+                    turn += 1
+                elif self._running:
+                    self._collect()
+                elif self._is_empty and not self._suspects:
+                    break
+            if self._failure is not None:
+                raise self._failure
+        finally:
+            if self._stop is not None:
+                self._stop.set()
+            for future in self._running:
+                future.cancel()
+            if self._is_ours:
+                if self._running:
+                    _terminate(self._executor)
+                self._executor.shutdown(wait=True)
+
+    def _fill(self) -> None:
+        if any(task.is_suspect for task in self._running.values()):
+            return  # alone, so that it is known who is to blame
+        if self._suspects:
+            if not self._running:
+                self._submit(self._suspects.popleft())
+            return
+        while not self._is_empty and len(self._running) + len(self._done) < self._window:
+            try:
+                item = next(self._items)
+            except StopIteration:
+                self._is_empty = True
+            except Exception as error:
+                self._is_empty, self._failure = True, error
+            else:
+                self._submit(_Task(self._num_taken, item))
+                self._num_taken += 1
+
+    def _submit(self, task: _Task[_T]) -> None:
+        try:
+            future = self._executor.submit(self._call, task.item)
+        except Exception as error:  # it cannot be pickled, or the executor is broken or shut down
+            future = Future()
+            future.set_exception(error)
+        self._running[future] = task
+
+    def _collect(self) -> None:
+        """Wait for the first to end. If that is by the executor's breaking, all others end by it, too."""
+        lost: list[tuple[_Task[_T], Exception]] = []
+        while self._running:
+            ended, _ = wait(self._running, _TICK_S, FIRST_COMPLETED)
+            for future in ended:
+                task = self._running.pop(future)
+                try:
+                    self._finish(task, future.result())
+                except BrokenExecutor as error:
+                    lost.append((task, error))
+                except Exception as error:
+                    self._finish(task, self._as_value(task, error))
+            if ended and not lost:
+                return
+        if lost:
+            self._recover(sorted(lost, key=lambda pair: pair[0].index))
+
+    def _recover(self, lost: list[tuple[_Task[_T], Exception]]) -> None:
+        for task, error in lost:
+            task.num_crashes += task.is_suspect
+            if not self._is_ours or task.num_crashes > self._retries:
+                self._finish(task, self._as_value(task, error))
+            else:
+                task.is_suspect = True
+                self._suspects.append(task)
+        if self._is_ours:
+            self._executor.shutdown(wait=True)
+            self._executor = self._make()
+
+    def _as_value(self, task: _Task[_T], error: Exception) -> JobError:
+        name = getattr(task.item, "name", None) or getattr(task.item, "path", None)
+        return JobError(task.index, None if name is None else str(name), error)
+
+    def _finish(self, task: _Task[_T], value: _R | JobError) -> None:
+        self._done[task.index] = value
+        if self._callback is not None:
+            self._callback(task.index, value)
+
+
+class RayExecutor(Executor):
+    """Runs calls as tasks of Ray, which has no executor of its own: ``pip install 'ibi_rs[ray]'``.
+
+    A task whose worker dies is run again by Ray, ``max_retries`` times.
+
+    Parameters
+    ----------
+    **options
+        Those of ``ray.remote``: ``num_cpus=2``, ``max_retries=5``, ...
+
+    Raises
+    ------
+    ImportError
+        Ray is not installed; the message names the extra.
+
+    Examples
+    --------
+    >>> import ray                                                                   # doctest: +SKIP
+    >>> ray.init()                                                                   # doctest: +SKIP
+    >>> for found in ibi.register_batch(jobs, ibi.RayExecutor()): ...                # doctest: +SKIP
+    """
+
+    def __init__(self, **options: Any) -> None:
+        try:
+            import ray
+        except ImportError as error:
+            raise ImportError(f"Ray is needed: pip install 'ibi_rs[ray]' ({error})") from error
+        self._ray = ray
+        self._remote = ray.remote(**options)(_call) if options else ray.remote(_call)
+
+    def submit(self, fn: Callable[..., _R], /, *args: Any, **kwargs: Any) -> Future[_R]:
+        """Start a task; its future has the result, or the error as it was raised.
+
+        Parameters
+        ----------
+        fn, *args, **kwargs
+            As in :meth:`concurrent.futures.Executor.submit`.
+
+        Returns
+        -------
+        Future
+        """
+        task = self._remote.remote(fn, args, kwargs)
+        future: Future[_R] = Future()
+
+        def ended(inner: Future[_R]) -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            error = inner.exception()
+            if error is None:
+                future.set_result(inner.result())
+            else:
+                # Ray's own wraps it, with a message of many lines.
+                future.set_exception(getattr(error, "cause", None) or error)
+
+        def cancelled(outer: Future[_R]) -> None:
+            if outer.cancelled():
+                self._ray.cancel(task)
+
+        future.add_done_callback(cancelled)
+        task.future().add_done_callback(ended)
+        return future
+
+
+def _call(fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    return fn(*args, **kwargs)
