@@ -36,6 +36,14 @@ test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and 
 	cargo test --workspace --exclude ibi-py --all-features
 	$(BIN)/python -m pytest
 
+.PHONY: test-clusters
+test-clusters: $(STAMPS)/package $(STAMPS)/group-clusters ## run batches on a local cluster of Dask and of Ray (installs them)
+	$(BIN)/python -m pytest tests/test_clusters.py
+
+.PHONY: test-viz
+test-viz: $(STAMPS)/package $(STAMPS)/group-viz ## read recordings of Rerun back (installs it)
+	$(BIN)/python -m pytest tests/test_viz.py
+
 .PHONY: bench
 bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac picks some
 	cargo bench -p ibi-core --bench '*' -- $(ARGS)

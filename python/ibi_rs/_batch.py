@@ -238,9 +238,10 @@ def register_batch(
         Jobs that are under way, or done and not given yet, at a time. Default: in threads of this process two
         for each, in an executor 64; should be twice its workers or more.
     retries : int, optional
-        How often a job whose worker has died is run again, on executors that the callable makes. All jobs
-        under way when it died are run again, one at a time; only one that breaks the executor on its own
-        counts as failed. Dask and Ray do so by their own settings.
+        How often a job is run again that has killed its worker on its own. All jobs that a dying worker takes
+        with it are run again, one at a time, so that it is known which. Not in an executor that a death
+        breaks and that no callable can make anew, such as a ``ProcessPoolExecutor``: there all jobs from then
+        on are errors. Ray and Dask run jobs again by settings of their own, before they give them up.
     callback : callable, optional
         Called with the job's index and its result as soon as a job ends, in any order; in the thread that
         asks for results.
@@ -315,7 +316,9 @@ def _given(executor: Executor) -> Executor:
     return executor
 
 
-def _run(job: Job, num_threads: int | None, stop: threading.Event | None = None) -> Registration:
+def _run(
+    job: Job, _attempt: int, *, num_threads: int | None, stop: threading.Event | None = None
+) -> Registration:
     # In a thread Ctrl-C is not seen: the callback ends the run.
     callback = None if stop is None else lambda _round: not stop.is_set()
     return job.run(num_threads=num_threads, callback=callback)
@@ -371,7 +374,7 @@ class _Batch(Generic[_T, _R]):
 
     def __init__(
         self,
-        call: Callable[[_T], _R],
+        call: Callable[[_T, int], _R],
         items: Iterable[_T],
         make: Callable[[], Executor],
         *,
@@ -435,7 +438,8 @@ class _Batch(Generic[_T, _R]):
 
     def _submit(self, task: _Task[_T]) -> None:
         try:
-            future = self._executor.submit(self._call, task.item)
+            # The attempt makes it another call: Dask remembers how equal ones have ended.
+            future = self._executor.submit(self._call, task.item, task.num_crashes + task.is_suspect)
         except Exception as error:  # it cannot be pickled, or the executor is broken or shut down
             future = Future()
             future.set_exception(error)
@@ -443,33 +447,38 @@ class _Batch(Generic[_T, _R]):
 
     def _collect(self) -> None:
         """Wait for the first to end. If that is by the executor's breaking, all others end by it, too."""
-        lost: list[tuple[_Task[_T], Exception]] = []
+        lost: list[tuple[_Task[_T], BrokenExecutor]] = []
         while self._running:
             ended, _ = wait(self._running, _TICK_S, FIRST_COMPLETED)
             for future in ended:
                 task = self._running.pop(future)
                 try:
                     self._finish(task, future.result())
-                except BrokenExecutor as error:
-                    lost.append((task, error))
+                except BrokenExecutor as death:
+                    lost.append((task, death))
                 except Exception as error:
-                    self._finish(task, self._as_value(task, error))
+                    if type(error).__name__ == "KilledWorker":  # Dask's, which blames all that wait there
+                        self._run_again(task, error)
+                    else:
+                        self._finish(task, self._as_value(task, error))
             if ended and not lost:
                 return
-        if lost:
-            self._recover(sorted(lost, key=lambda pair: pair[0].index))
-
-    def _recover(self, lost: list[tuple[_Task[_T], Exception]]) -> None:
-        for task, error in lost:
-            task.num_crashes += task.is_suspect
-            if not self._is_ours or task.num_crashes > self._retries:
-                self._finish(task, self._as_value(task, error))
+        for task, cause in sorted(lost, key=lambda pair: pair[0].index):
+            if self._is_ours:
+                self._run_again(task, cause)
             else:
-                task.is_suspect = True
-                self._suspects.append(task)
-        if self._is_ours:
+                self._finish(task, self._as_value(task, cause))
+        if lost and self._is_ours:
             self._executor.shutdown(wait=True)
             self._executor = self._make()
+
+    def _run_again(self, task: _Task[_T], error: Exception) -> None:
+        task.num_crashes += task.is_suspect
+        if task.num_crashes > self._retries:
+            self._finish(task, self._as_value(task, error))
+        else:
+            task.is_suspect = True
+            self._suspects.append(task)
 
     def _as_value(self, task: _Task[_T], error: Exception) -> JobError:
         name = getattr(task.item, "name", None) or getattr(task.item, "path", None)

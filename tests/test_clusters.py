@@ -1,0 +1,142 @@
+"""`register_batch` on a local cluster of Dask and of Ray, for real: `make test-clusters` has these run."""
+
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import ibi_rs as ibi
+import pytest
+from test_batch import EXPECTED, JOBS, MODEL, SCENES, content, values
+
+NO_CLUSTERS = "large, so not in the group of the tests: `make test-clusters` installs it and has these run"
+LIMIT_S = 60
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Deadly(ibi.Job):
+    """Kills its worker until the file exists that it is named by; every time, if it is named "always"."""
+
+    def run(self, **options):
+        if os.path.exists(self.name):
+            return super().run(**options)
+        if self.name != "always":
+            Path(self.name).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def deadly(name):
+    return Deadly(MODEL, SCENES[0].tgt, SCENES[0].corr, name=str(name))
+
+
+# Dask ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def dask_client():
+    pytest.importorskip("distributed", reason=NO_CLUSTERS)
+    import dask
+    from distributed import Client, LocalCluster
+
+    # No dashboard and no files here; and a job that kills two workers is lost, not only one that kills four.
+    dask.config.set({"distributed.scheduler.allowed-failures": 1})
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def test_dask_gives_results_and_errors_in_order(dask_client):
+    assert values(JOBS, dask_client.get_executor()) == EXPECTED
+    assert values(iter(JOBS * 3), dask_client.get_executor(), window=4) == [
+        one.replace("job 2", f"job {index}") if isinstance(one, str) else one
+        for index, one in enumerate(EXPECTED * 3)
+    ]
+
+
+def test_dask_runs_the_job_of_a_worker_that_dies_again(dask_client, tmp_path):
+    jobs = [deadly(tmp_path / "was here"), *JOBS[1:]]
+    assert values(jobs, dask_client.get_executor(pure=False)) == EXPECTED
+
+
+def test_dask_gives_up_a_job_that_kills_all_its_workers(dask_client):
+    jobs = [deadly("always"), JOBS[1], JOBS[0], JOBS[1]]  # which Dask gives up with it
+    first, *rest = ibi.register_batch(jobs, dask_client.get_executor())
+    assert isinstance(first, ibi.JobError)
+    assert type(first.error).__name__ == "KilledWorker"
+    assert [content(one) for one in rest] == [EXPECTED[1], EXPECTED[0], EXPECTED[1]]
+
+
+def test_dask_reads_files_where_the_job_runs(dask_client, tmp_path):
+    (found,) = ibi.register_batch(
+        [ibi.Job(MODEL, tmp_path / "none.ply", SCENES[0].corr)], dask_client.get_executor()
+    )
+    assert str(found) == f"job 0: {tmp_path / 'none.ply'}: no such file"
+
+
+def test_dask_drops_what_waits_when_a_batch_is_closed(dask_client):
+    found = ibi.register_batch(JOBS * 4, dask_client.get_executor(pure=False))
+    assert content(next(found)) == EXPECTED[0]
+    found.close()
+    deadline = time.monotonic() + LIMIT_S
+    while any(dask_client.processing().values()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(dask_client.processing().values())
+
+
+def test_a_dask_client_is_no_executor(dask_client):
+    with pytest.raises(TypeError, match=r"of Dask client.get_executor\(\)"):
+        ibi.register_batch(JOBS, dask_client)
+
+
+# Ray -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ray():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_AUTH_MODE", "disabled")  # it would leave a token in the home directory
+        patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # its default warns of itself
+        patch.setenv("PYTHONPATH", os.path.dirname(__file__))  # of the workers, for `Deadly`
+        ray = pytest.importorskip("ray", reason=NO_CLUSTERS)
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, configure_logging=False)
+        yield ray
+        ray.shutdown()
+
+
+def test_ray_gives_results_and_errors_in_order(ray):
+    assert values(JOBS, ibi.RayExecutor()) == EXPECTED
+    assert values(JOBS, ibi.RayExecutor, window=2) == EXPECTED
+
+
+def test_ray_runs_the_job_of_a_worker_that_dies_again(ray, tmp_path):
+    jobs = [deadly(tmp_path / "was here"), *JOBS[1:]]
+    assert values(jobs, ibi.RayExecutor(max_retries=1)) == EXPECTED
+
+
+def test_ray_gives_up_a_job_that_kills_all_its_workers(ray):
+    jobs = [deadly("always"), JOBS[1]]
+    first, *rest = ibi.register_batch(jobs, ibi.RayExecutor(max_retries=1, num_cpus=1))
+    assert isinstance(first.error, ray.exceptions.WorkerCrashedError)
+    assert str(first).startswith("job 0, always: WorkerCrashedError: The worker died")
+    assert [content(one) for one in rest] == EXPECTED[1:2]
+
+
+def test_ray_drops_what_waits_when_a_batch_is_closed(ray):
+    executor = ibi.RayExecutor()
+    found = ibi.register_batch(JOBS * 4, executor)
+    assert content(next(found)) == EXPECTED[0]
+    found.close()
+    assert executor.submit(int, "3").result(LIMIT_S) == 3
+
+
+# Neither -------------------------------------------------------------------------------------------------
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ImportError, match=r"^Ray is needed: pip install 'ibi_rs\[ray\]'"):
+        ibi.RayExecutor()
