@@ -3,7 +3,7 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import features, io, metrics, plot, stages, synth
+from ibi_rs import features, io, metrics, plot, stages, synth, viz
 from ibi_rs._batch import Job, JobError, RayExecutor, register_batch
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._detect import Matches
@@ -69,4 +69,5 @@ __all__ = [
     "register_batch",
     "stages",
     "synth",
+    "viz",
 ]
