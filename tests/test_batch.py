@@ -94,6 +94,7 @@ def test_a_job_is_register():
 @pytest.mark.parametrize("num_threads", [None, 1, 3])
 def test_own_threads_give_results_and_errors_in_order(num_threads):
     assert values(JOBS, num_threads=num_threads) == EXPECTED
+    assert values(JOBS, 3, num_threads=num_threads) == EXPECTED
 
 
 def test_any_executor_serves_and_is_left_running():
@@ -187,11 +188,13 @@ def test_results_wait_for_their_turn_and_progress_does_not():
 
 
 def test_cores_are_shared_and_not_oversubscribed(monkeypatch):
-    assert _batch._share(8, 100, None) == (8, 1)
-    assert _batch._share(8, 3, None) == (3, 2)
-    assert _batch._share(8, 0, None) == (1, 8)
-    assert _batch._share(8, 100, 3) == (2, 3)
-    assert _batch._share(2, 100, 16) == (1, 16)
+    assert _batch._share(8, 100, None, None) == (8, 1)
+    assert _batch._share(8, 3, None, None) == (3, 2)
+    assert _batch._share(8, 0, None, None) == (1, 8)
+    assert _batch._share(8, 100, 3, None) == (2, 3)
+    assert _batch._share(2, 100, 16, None) == (1, 16)
+    assert _batch._share(8, 100, None, 3) == (3, 2)
+    assert _batch._share(8, 2, 1, 3) == (2, 1)
     assert 1 <= _batch._cores() <= os.cpu_count()
     monkeypatch.setenv("IBI_NUM_THREADS", "5")
     assert _batch._cores() == 5
@@ -208,7 +211,9 @@ def test_no_jobs_give_no_results():
 @pytest.mark.parametrize(
     ("options", "kind", "message"),
     [
-        ({"executor": 3}, TypeError, "executor must be a concurrent.futures.Executor .* not int"),
+        ({"executor": "3"}, TypeError, "executor must be a concurrent.futures.Executor .* not str"),
+        ({"executor": 0}, ibi.InputError, "executor is 0; it must be at least 1"),
+        ({"executor": True}, TypeError, "executor must be an integer, not bool"),
         ({"callback": 3}, TypeError, "callback must be callable, not int"),
         ({"window": 0}, ibi.InputError, "window is 0; it must be at least 1"),
         ({"retries": -1}, ibi.InputError, "retries is -1; it must be at least 0"),

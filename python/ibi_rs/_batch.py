@@ -198,19 +198,24 @@ class JobError(Exception):
         self.index, self.name, self.error = index, name, error
         self.__cause__ = error
 
-    def __str__(self) -> str:
+    @property
+    def reason(self) -> str:
+        """What went wrong, in one line."""
         lines = str(self.error).strip().splitlines()
         text = lines[0] if lines else ""
-        if not text or not isinstance(self.error, (InputError, ParamsError, ImportError, OSError)):
-            text = f"{type(self.error).__name__}: {text}".removesuffix(": ")
+        if text and isinstance(self.error, (InputError, ParamsError, ImportError, OSError)):
+            return text
+        return f"{type(self.error).__name__}: {text}".removesuffix(": ")
+
+    def __str__(self) -> str:
         # Errors of a file name it themselves.
-        name = f", {self.name}" if self.name and self.name not in text else ""
-        return f"job {self.index}{name}: {text}"
+        name = f", {self.name}" if self.name and self.name not in self.reason else ""
+        return f"job {self.index}{name}: {self.reason}"
 
 
 def register_batch(
     jobs: Iterable[Job],
-    executor: Executor | Callable[[], Executor] | None = None,
+    executor: Executor | Callable[[], Executor] | int | None = None,
     *,
     num_threads: int | None = None,
     window: int | None = None,
@@ -226,10 +231,10 @@ def register_batch(
     ----------
     jobs : iterable of Job
         A list, or a generator, which is asked for no more than ``window`` jobs ahead of the results.
-    executor : Executor, or callable that makes one, optional
-        Where the jobs run. Default: threads of this process. An executor is left as it is; one that the
-        callable makes is shut down at the end, and made anew if a worker's death breaks it. Dask:
-        ``client.get_executor()``; Ray: :class:`RayExecutor`.
+    executor : Executor, callable that makes one, or int; optional
+        Where the jobs run. Default: threads of this process, one for each core, or so many. An executor is
+        left as it is; one that the callable makes is shut down at the end, and made anew if a worker's death
+        breaks it. Dask: ``client.get_executor()``; Ray: :class:`RayExecutor`.
     num_threads : int, optional
         Of each job that does not say itself. Default: in threads of this process what shares the cores among
         the jobs (``IBI_NUM_THREADS``, else those the process may use), in an executor 1, as the executor has
@@ -282,8 +287,9 @@ def register_batch(
     threads = None if num_threads is None else _num_threads(num_threads)
     stop = threading.Event()
     make: Callable[[], Executor]
-    if executor is None:
-        workers, threads = _share(_cores(), operator.length_hint(jobs, 2**31), threads)
+    if executor is None or isinstance(executor, int):
+        most = None if executor is None else _count("executor", executor, 1)
+        workers, threads = _share(_cores(), operator.length_hint(jobs, 2**31), threads, most)
         make, default = functools.partial(ThreadPoolExecutor, workers, "ibi-batch"), 2 * workers
         call = functools.partial(_run, num_threads=threads, stop=stop)
     else:
@@ -294,7 +300,7 @@ def register_batch(
         else:
             raise TypeError(
                 "executor must be a concurrent.futures.Executor (of Dask client.get_executor(), of Ray "
-                f"ibi_rs.RayExecutor()) or a callable that makes one, not {type(executor).__name__}"
+                f"ibi_rs.RayExecutor()), a callable that makes one, or an int, not {type(executor).__name__}"
             )
         default = _WINDOW
         call = functools.partial(_run, num_threads=threads or 1)
@@ -353,9 +359,9 @@ def _terminate(executor: Executor) -> None:
             process.terminate()
 
 
-def _share(cores: int, num_jobs: int, num_threads: int | None) -> tuple[int, int]:
-    """Jobs at a time, and threads of each."""
-    workers = max(1, min(num_jobs, cores // (num_threads or 1)))
+def _share(cores: int, num_jobs: int, num_threads: int | None, most: int | None) -> tuple[int, int]:
+    """Jobs at a time, at most so many, and threads of each."""
+    workers = max(1, min(num_jobs, most or cores // (num_threads or 1)))
     return workers, num_threads or max(1, cores // workers)
 
 
