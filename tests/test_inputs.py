@@ -1,5 +1,6 @@
 """The table of inputs: what is taken as it is meant, what is refused and how, what finds nothing."""
 
+import tempfile
 from typing import get_args
 
 import ibi_rs as ibi
@@ -28,6 +29,10 @@ def content(found):
 PLAIN = register()
 
 
+NO_OPEN3D = "large, so not in the group of the tests: `make .venv/stamps/open3d test` has these run"
+NO_TORCH = "large, so in no group: `.venv/bin/python -m pip install torch` has these run"
+
+
 class Holder:
     """Something with one attribute, as Open3D's point clouds and trimesh's meshes are to us."""
 
@@ -54,6 +59,51 @@ class Arrayish:
 
     def __array__(self, dtype=None, copy=None):
         return np.array(self.array, dtype=dtype)
+
+
+class OfDlpack:
+    """An array of another library, that speaks DLPack and nothing else: Open3D's tensors."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def __dlpack__(self, **options):
+        return self.array.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self.array.__dlpack_device__()
+
+
+class OfTorch:
+    """A tensor of PyTorch, as far as numpy sees it; with the errors of those that are no arrays."""
+
+    def __init__(self, array, error=None):
+        self.array, self.error = array, error
+        self.shape = np.shape(array)
+
+    def __array__(self, dtype=None, copy=None):
+        if self.error:
+            raise self.error
+        return np.array(self.array, dtype=dtype)
+
+    def __dlpack__(self, **options):
+        raise BufferError("not to be asked")
+
+
+GRADIENT = RuntimeError(
+    "Can't call numpy() on Tensor that requires grad. Use tensor.detach().numpy() instead."
+)
+ON_GPU = TypeError(
+    "can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() to copy it to host memory first."
+)
+BFLOAT16 = TypeError("Got unsupported ScalarType BFloat16")
+
+
+def memory_map(array):
+    with tempfile.TemporaryFile() as file:
+        mapped = np.memmap(file, array.dtype, "w+", shape=array.shape)
+        mapped[:] = array
+        return mapped
 
 
 def read_only(array):
@@ -89,6 +139,10 @@ LAYOUTS = {
     "little-endian": lambda a: a.astype(a.dtype.newbyteorder("<")),
     "__array__": Arrayish,
     "sequence of rows": Rows,
+    "__dlpack__": OfDlpack,
+    "torch": OfTorch,
+    "memory map": memory_map,
+    "masked, with no mask": np.ma.asarray,
     "memoryview": memoryview,
     "matrix of another class": lambda a: a.view(type("Tracked", (np.ndarray,), {})),
 }
@@ -101,6 +155,8 @@ CLOUDS = {
     ".points": lambda a: Holder("points", a),
     ".points of rows": lambda a: Holder("points", Rows(a)),
     ".vertices": lambda a: Holder("vertices", a),
+    ".point.positions": lambda a: Holder("point", Holder("positions", OfDlpack(a))),
+    ".vertex.positions": lambda a: Holder("vertex", Holder("positions", OfDlpack(a))),
 }
 ROWS = {
     **LAYOUTS,
@@ -122,6 +178,48 @@ def test_clouds_in_any_form_give_the_same(form):
 @pytest.mark.parametrize("form", ROWS.values(), ids=ROWS)
 def test_correspondences_in_any_form_give_the_same(form):
     assert content(register(corr=form(CORR))) == content(PLAIN)
+
+
+# The objects themselves ----------------------------------------------------------------------------------
+
+
+def test_objects_of_trimesh():
+    trimesh = pytest.importorskip("trimesh")
+    cloud, scene = trimesh.PointCloud(SRC), trimesh.PointCloud(TGT)
+    assert content(register(cloud, scene)) == content(PLAIN)
+    box = trimesh.creation.box((3, 2, 1))
+    by_arrays = ibi.Model.from_mesh(box.vertices, box.faces)
+    np.testing.assert_array_equal(ibi.Model.from_mesh(box).points, by_arrays.points)
+
+
+def test_objects_of_open3d():
+    o3d = pytest.importorskip("open3d", reason=NO_OPEN3D)
+    vectors = o3d.utility.Vector3dVector
+    cloud, scene = o3d.geometry.PointCloud(vectors(SRC)), o3d.geometry.PointCloud(vectors(TGT))
+    pairs = o3d.utility.Vector2iVector(CORR.astype(np.int32))
+    assert content(register(cloud, scene, pairs)) == content(PLAIN)
+    cloud, scene = (o3d.t.geometry.PointCloud(o3d.core.Tensor(a)) for a in (SRC, TGT))
+    assert content(register(cloud, scene, o3d.core.Tensor(CORR))) == content(PLAIN)
+    assert content(register(cloud.point.positions, scene.point.positions)) == content(PLAIN)
+    box = o3d.geometry.TriangleMesh.create_box(3, 2, 1)
+    by_arrays = ibi.Model.from_mesh(np.asarray(box.vertices), np.asarray(box.triangles))
+    np.testing.assert_array_equal(ibi.Model.from_mesh(box).points, by_arrays.points)
+
+
+def test_tensors_of_torch():
+    torch = pytest.importorskip("torch", reason=NO_TORCH)
+    src, tgt, corr = map(torch.from_numpy, (SRC, TGT, CORR))
+    assert content(register(src, tgt, corr)) == content(PLAIN)
+    points = torch.hstack([src[corr[:, 0]], tgt[corr[:, 1]]])
+    assert content(register(src.half(), tgt.float(), points)) == content(PLAIN)
+    assert content(register(src, tgt, (points[:, :3], points[:, 3:]))) == content(PLAIN)
+    for tensor in (src.clone().requires_grad_(), src.bfloat16(), src.to("meta"), src.to_sparse()):
+        with pytest.raises(TypeError, match=r"^src cannot be read as an array: ") as caught:
+            register(src=tensor)
+        assert "\n" not in str(caught.value)
+
+
+# -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.int32, np.int64])
@@ -205,6 +303,10 @@ REFUSED = [
             ({name: object()}, T, rf"{name} has dtype object{REAL}"),
             ({name: Holder("points", None)}, T, rf"{name} has dtype object{REAL}"),
             ({name: RAGGED}, A, rf"{name} is not a rectangular array"),
+            ({name: OfTorch(cloud, GRADIENT)}, T, rf"{name} cannot be read as an array: .*\.detach\(\)"),
+            ({name: OfTorch(cloud, ON_GPU)}, T, rf"{name} cannot be read as an array: .*\.cpu\(\)"),
+            ({name: OfTorch(cloud, BFLOAT16)}, T, rf"{name} cannot be read as an array: .*BFloat16"),
+            ({name: np.ma.masked_less(cloud, 0)}, A, rf"{name} has masked entries; leave those rows out"),
             ({name: put(cloud, (7, 1), NAN)}, A, rf"{name}\[7\] is .*NaN.*{FINITE}"),
             ({name: put(cloud, (7, 1), INF)}, A, rf"{name}\[7\] is .*inf.*{FINITE}"),
             ({name: put(cloud, (7, 1), -1e200)}, A, rf"{name}\[7\] is .*{FINITE} and below 1e100"),
@@ -243,6 +345,8 @@ REFUSED = [
     ({"corr": put(np.ones((9, 6)), (2, 4), INF)}, A, rf"corr\[2\] is .*inf.*{FINITE}"),
     ({"corr": (SRC[:5], TGT[:4])}, A, r"corr is a pair of 5 and 4 points; it must be of equally many"),
     ({"corr": (SRC[:5], TGT[:5] > 0)}, T, rf"corr\[1\] has dtype bool{REAL}"),
+    ({"corr": (OfTorch(SRC[:5], GRADIENT), TGT[:5])}, T, r"corr\[0\] cannot be read as an array: .*detach"),
+    ({"corr": OfTorch(CORR, ON_GPU)}, T, r"corr cannot be read as an array: .*\.cpu\(\)"),
     ({"src_normals": ONES["src_normals"]}, A, r"src_normals is given but tgt_normals is not; .*both"),
     ({"tgt_normals": ONES["tgt_normals"]}, A, r"tgt_normals is given but src_normals is not; .*both"),
     *(

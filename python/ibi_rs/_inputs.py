@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from ibi_rs._core import InputError
 
 Points = Any
-"""(N, 3) real numbers, or an object with ``.points``, ``.vertices`` or ``__array__``."""
+"""(N, 3) real numbers, or an object with ``.points``, ``.vertices``, ``__array__`` or ``__dlpack__``."""
 
 _MAX_THREADS = 65535
 """As many as rayon can tell apart."""
@@ -20,9 +21,17 @@ _MAX_THREADS = 65535
 def _real(name: str, value: Any) -> npt.NDArray[Any]:
     """Any array of real numbers."""
     try:
+        if hasattr(value, "__dlpack__") and not hasattr(value, "__array__"):  # Open3D's tensors
+            value = np.from_dlpack(value)
         array = np.asarray(value)
     except ValueError as error:  # ragged lists
         raise InputError(f"{name} is not a rectangular array: {error}") from None
+    except (BufferError, RuntimeError, TypeError) as error:  # tensors on a GPU, with a gradient, of bfloat16
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise TypeError(f"{name} cannot be read as an array: {reason}") from None
+    # Not imported for the question: without the module there is none.
+    if "numpy.ma" in sys.modules and np.ma.is_masked(value):
+        raise InputError(f"{name} has masked entries; leave those rows out")
     if array.dtype.kind not in "fiu":  # a timedelta is an np.integer
         raise TypeError(f"{name} has dtype {array.dtype}; it must be real numbers")
     return array
@@ -39,6 +48,8 @@ def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
     if not isinstance(value, np.ndarray):
         for attribute in ("points", "vertices"):
             value = getattr(value, attribute, value)
+        for attribute in ("point", "vertex"):  # Open3D's tensor geometry
+            value = getattr(getattr(value, attribute, None), "positions", value)
     array = _real(name, value)
     if array.shape == (0,):
         array = array.reshape(0, 3)
@@ -95,7 +106,7 @@ def _is_rows3(side: Any) -> bool:
     """Whether this is a list of points, of which two make a pair, and not one row of indices."""
     try:
         shape = np.shape(side)
-    except ValueError:  # ragged; who reads it next says so
+    except (BufferError, RuntimeError, TypeError, ValueError):  # who reads it next says so
         return False
     return len(shape) == 2 and shape[1] == 3
 
