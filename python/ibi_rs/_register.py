@@ -53,7 +53,8 @@ def register(
     ----------
     src, tgt : (N, 3) array_like
         The model (source) and the scene (target) in the same unit of length, of any real dtype; or an object
-        with ``.points`` (Open3D), ``.vertices`` (trimesh) or ``__array__``. At least 3 points each.
+        with ``.points`` (Open3D), ``.vertices`` (trimesh), ``__array__`` or ``__dlpack__`` (tensors, on the
+        CPU). At least 3 points each.
     corr : (M, 2) array_like of int, (M, 6) array_like, or pair of (M, 3) arrays
         Putative correspondences: [source row, target row], or the source point and the target point
         themselves.

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs._core import InputError
-from ibi_rs._inputs import Points, _correspondences, _points
+from ibi_rs._inputs import Points, _correspondences, _count, _points
 
 if TYPE_CHECKING:
     from ibi_rs.registration import Registration, Round
@@ -66,6 +66,10 @@ def record(
     max_outliers : int
         Most lines of the label -1; at least 0.
 
+    Returns
+    -------
+    None
+
     Raises
     ------
     InputError
@@ -82,6 +86,7 @@ def record(
         raise ImportError(f"recordings need Rerun: pip install 'ibi_rs[viz]' ({error})") from error
     scene, model = _points("tgt", tgt), _points("src", src)
     lines = None if corr is None else _ends(scene, model, corr, len(registration.labels))
+    max_outliers = _count("max_outliers", max_outliers, 0)
     path = Path(path)
     path.open("wb").close()  # Rerun would only log that it cannot
 
