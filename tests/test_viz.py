@@ -19,8 +19,7 @@ def rr():
 
 def read(path):
     """Each entity's rows: dicts of its columns, by the last word of their names."""
-    from rerun.chunk import RrdReader
-
+    RrdReader = pytest.importorskip("rerun.chunk", reason="needs Rerun 0.41, and so Python 3.11").RrdReader
     rows = defaultdict(list)
     for chunk in RrdReader(path).stream().to_chunks():
         for row in chunk.to_record_batch().to_pylist():

@@ -6,6 +6,7 @@ import functools
 import operator
 import os
 import pickle
+import sys
 import threading
 import weakref
 from collections import deque
@@ -240,8 +241,8 @@ def register_batch(
         the jobs (``IBI_NUM_THREADS``, else those the process may use), in an executor 1, as the executor has
         the workers.
     window : int, optional
-        Jobs that are under way, or done and not given yet, at a time. Default: in threads of this process two
-        for each, in an executor 64; should be twice its workers or more.
+        Jobs that are under way, or done and not given yet, at a time. Default: in threads of this process
+        four for each, in an executor 64; should be twice its workers or more.
     retries : int, optional
         How often a job is run again that has killed its worker on its own. All jobs that a dying worker takes
         with it are run again, one at a time, so that it is known which. Not in an executor that a death
@@ -290,7 +291,7 @@ def register_batch(
     if executor is None or isinstance(executor, int):
         most = None if executor is None else _count("executor", executor, 1)
         workers, threads = _share(_cores(), operator.length_hint(jobs, 2**31), threads, most)
-        make, default = functools.partial(ThreadPoolExecutor, workers, "ibi-batch"), 2 * workers
+        make, default = functools.partial(ThreadPoolExecutor, workers, "ibi-batch"), 4 * workers
         call = functools.partial(_run, num_threads=threads, stop=stop)
     else:
         if isinstance(executor, Executor):
@@ -350,13 +351,23 @@ def _cores() -> int:
     return cores
 
 
-def _terminate(executor: Executor) -> None:
-    """End worker processes at once, which would take up the jobs that they have been sent."""
-    if hasattr(executor, "terminate_workers"):  # Python 3.14
-        executor.terminate_workers()
-    else:
-        for process in list((getattr(executor, "_processes", None) or {}).values()):
-            process.terminate()
+def _terminate(executor: Executor) -> bool:
+    """End worker processes, which would take up the jobs that they have been sent; say if there are any.
+
+    What waits must not be cancelled then: older Pythons stumble over it.
+    """
+    processes = list((getattr(executor, "_processes", None) or {}).values())
+    for process in processes:
+        process.terminate()
+    return bool(processes)
+
+
+def _shut_down(executor: Executor, *, is_broken: bool) -> None:
+    # Older Pythons wait for ever to send what nobody reads any more (python/cpython#94777).
+    queue = getattr(executor, "_call_queue", None)
+    if is_broken and queue is not None and sys.version_info < (3, 11, 5):
+        queue._reader.close()
+    executor.shutdown(wait=True)
 
 
 def _share(cores: int, num_jobs: int, num_threads: int | None, most: int | None) -> tuple[int, int]:
@@ -417,12 +428,12 @@ class _Batch(Generic[_T, _R]):
         finally:
             if self._stop is not None:
                 self._stop.set()
-            for future in self._running:
-                future.cancel()
+            is_broken = bool(self._running) and self._is_ours and _terminate(self._executor)
+            if not is_broken:
+                for future in self._running:
+                    future.cancel()
             if self._is_ours:
-                if self._running:
-                    _terminate(self._executor)
-                self._executor.shutdown(wait=True)
+                _shut_down(self._executor, is_broken=is_broken)
 
     def _fill(self) -> None:
         if any(task.is_suspect for task in self._running.values()):
@@ -475,7 +486,7 @@ class _Batch(Generic[_T, _R]):
             else:
                 self._finish(task, self._as_value(task, cause))
         if lost and self._is_ours:
-            self._executor.shutdown(wait=True)
+            _shut_down(self._executor, is_broken=True)
             self._executor = self._make()
 
     def _run_again(self, task: _Task[_T], error: Exception) -> None:

@@ -91,8 +91,9 @@ def record(
     path.open("wb").close()  # Rerun would only log that it cannot
 
     stream = rr.RecordingStream("ibi_rs")
-    stream.set_log_time_enabled(False)  # when and in which order it was written is of no interest
-    stream.set_log_tick_enabled(False)
+    if hasattr(stream, "set_log_time_enabled"):  # newer than the oldest that serves
+        stream.set_log_time_enabled(False)  # when and in which order it was written is of no interest
+        stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=_blueprint())
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)  # as a camera sees it, and `ibi.plot`
     stream.log("scene", rr.Points3D(scene, colors=_GREY), static=True)
