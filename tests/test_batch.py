@@ -251,7 +251,7 @@ def test_what_cannot_be_sent_is_an_error_in_its_place():
     first, bad, last = ibi.register_batch(jobs, partial(processes, "spawn", 1))
     assert [content(first), content(last)] == EXPECTED[:2]
     assert isinstance(bad, ibi.JobError)
-    assert "pickle" in str(bad)
+    assert "<lambda>" in str(bad)
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
     assert values(JOBS[:1], pool) == ["job 0: RuntimeError: cannot schedule new futures after shutdown"]
@@ -376,4 +376,4 @@ def test_ctrl_c_ends_a_batch(where, tmp_path):
     assert child.returncode == 0, err
     latency_s = float(out) - sent
     print(f"{where}: KeyboardInterrupt {latency_s:.3f} s after Ctrl-C")
-    assert latency_s < 3
+    assert latency_s < 5  # a round, on a machine that is busy with something else
