@@ -72,6 +72,10 @@ bench-peers: $(STAMPS)/package $(STAMPS)/open3d peers pcl ## compare with PCL, O
 bench-detect: $(STAMPS)/package $(STAMPS)/group-test ## from mesh and scan to poses on the real scans; ARGS=--docs records
 	$(BIN)/python benchmarks/detect.py $(ARGS)
 
+.PHONY: bench-piles
+bench-piles: $(STAMPS)/package $(STAMPS)/group-test $(STAMPS)/open3d peers pcl ## detect in ray-cast piles, beside PCL and OpenCV; ARGS=--docs records (needs Open3D)
+	$(BIN)/python benchmarks/piles.py $(ARGS)
+
 .PHONY: bench-speed
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py

@@ -23,6 +23,7 @@ class Layout(IntEnum):
     ECC = 1
     OUTLIER = 2
     FPFH = 3
+    PILE = 4
 
 
 class Purpose(IntEnum):

@@ -18,12 +18,12 @@ _MIN_GROUP = 1000  # a sparser support would measure the sampling and not the su
 _NORMAL_NEIGHBORS = 30
 
 
-def load_open3d() -> Any:
+def load_open3d(who: str = "FPFH descriptors need") -> Any:
     """Open3D, imported late: it is optional, large and slow to load."""
     try:
         import open3d
     except ImportError as error:  # also when it is installed and one of its system libraries is not
-        message = f"FPFH descriptors need Open3D: pip install 'ibi_rs[open3d]' ({error})"
+        message = f"{who} Open3D: pip install 'ibi_rs[open3d]' ({error})"
         raise ImportError(message) from error
     return open3d
 
