@@ -115,10 +115,10 @@ pub enum SymmetryError {
         /// What is allowed.
         allowed: &'static str,
     },
-    /// A cloud without a surface to compare.
-    #[error("points has {len} rows; at least {least} are needed, not all on one line")]
+    /// Too few points to show a shape.
+    #[error("points has {len} rows that differ; at least {least} are needed")]
     TooFewPoints {
-        /// Number of rows.
+        /// How many there are.
         len: usize,
         /// How many there should be.
         least: usize,
@@ -168,7 +168,10 @@ impl Symmetries {
             };
         }
         let identity = Isometry3::identity();
-        let others = discrete.iter().filter(|&&motion| motion != identity);
+        // From a matrix it comes with rounding.
+        let is_identity =
+            |m: &Isometry3<f64>| m.rotation.angle() < 1e-12 && m.translation.vector == Vector3::zeros();
+        let others = discrete.iter().filter(|motion| !is_identity(motion));
         Ok(Self { discrete: [identity].iter().chain(others).copied().collect(), turning })
     }
 
