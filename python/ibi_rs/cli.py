@@ -13,6 +13,7 @@ import numpy as np
 
 import ibi_rs as ibi
 from ibi_rs import io, metrics
+from ibi_rs.symmetries import _bop_entry as bop_entry
 
 try:
     import typer
@@ -23,6 +24,8 @@ except ImportError as error:
 
 FOUND_NOTHING = 3
 """Exit code of `ibi register` where nothing is found; 1: the input is at fault; 2: the command line is."""
+
+SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has several objects"
 
 PRESETS = {
     "default": ibi.Params,
@@ -75,6 +78,9 @@ def register(
             help="Take the largest plane away, or not. Default: if it looks like a table.",
         ),
     ] = None,
+    symmetries: Annotated[
+        str, typer.Option(help=f"{SYMMETRIES}. Of poses that look the same the one turned least is given.")
+    ] = "none",
     preset: Annotated[
         str | None, typer.Option(help=f"{', '.join(PRESETS)}; by default what fits the scene.")
     ] = None,
@@ -105,13 +111,18 @@ def register(
         with err.status("reading") as status:
             tgt, tgt_normals = io.read_cloud(scene)
             if corr is not None:
-                src, _ = io.read_cloud(model)
+                src, src_normals = io.read_cloud(model)
+                held = _symmetries(symmetries, src, src_normals)
                 pairs = _pairs(corr)
                 status.update("registering")
-                found = ibi.register(src, tgt, pairs, chosen, **options)
+                found = ibi.Model(src, symmetries=held).register(tgt, pairs, chosen, **options)
             else:
-                part = ibi.Model.from_mesh(*io.read_mesh(model), voxel=voxel, num_threads=threads)
-                src = part.points
+                mesh = io.read_mesh(model)
+                wanted = None if symmetries == "find" else _symmetries(symmetries, mesh[0])
+                part = ibi.Model.from_mesh(
+                    *mesh, voxel=voxel, symmetries=wanted or "find", num_threads=threads
+                )
+                src, held = part.points, part.symmetries
                 status.update("detecting")
                 found = part.detect(
                     tgt,
@@ -123,7 +134,10 @@ def register(
                     **options,
                 )
         seconds = time.perf_counter() - start
+        found = found.canonical(held)
         _show(found, seconds)
+        if not held.is_none:
+            out.print(f"modulo {held!r}", style="dim", highlight=False)
         if output is not None:
             output.write_text(json.dumps(_as_dict(found, model, scene), indent=1) + "\n", encoding="utf-8")
         if bop is not None:
@@ -142,17 +156,42 @@ def evaluate(
     truth: Annotated[Path, typer.Argument(help="True poses: JSON with 'poses', or a (K, 4, 4) NPY.")],
     model: Annotated[Path, typer.Argument(help="Mesh or cloud of the part, for ADD-S and its diameter.")],
     diameters: Annotated[float, typer.Option(help="A pose is right within so many diameters.")] = 0.1,
+    symmetries: Annotated[
+        str | None, typer.Option(help=f"{SYMMETRIES}: adds rotation errors and MSSD, modulo these.")
+    ] = None,
 ) -> None:
     """Score poses against true ones: one to one, by ADD-S below a tenth of the model's diameter."""
     try:
         points = _surface(model)
+        held = _symmetries(symmetries or "none", points)
+        predicted, true = _poses(poses), _poses(truth)
         criterion = metrics.AddS(diameter_fraction=diameters)
-        score = metrics.score_scene(_poses(poses), _poses(truth), criterion=criterion, model=points)
+        score = metrics.score_scene(predicted, true, criterion=criterion, model=points, symmetries=held)
+        mssd = metrics.mssd_recall(predicted, true, model=points, symmetries=held)
     except (ibi.InputError, ImportError, OSError, TypeError, ValueError) as error:
         _fail(error)
     print(f"recall     {score.recall:.3f}  ({score.num_truth_hit} of {score.num_truth})")
     print(f"precision  {score.precision:.3f}  ({score.num_predicted_hit} of {score.num_predicted})")
     print(f"F1         {score.f1:.3f}")
+    if symmetries is not None:
+        turned = [match.rotation_error_deg for match in score.matches if match and match.is_hit]
+        print(f"MSSD       {mssd.average:.3f}  (BOP's average recall, modulo {held!r})")
+        if turned:
+            print(f"turned by  {np.median(turned):.1f} deg in the median, {max(turned):.1f} at most")
+
+
+def _symmetries(given: str, points: Any, normals: Any = None) -> ibi.Symmetries:
+    """Read, find or leave out the symmetries of a model."""
+    if given in ("find", "none"):
+        return ibi.find_symmetries(points, normals) if given == "find" else ibi.Symmetries.none()
+    path, _, number = given.rpartition(":")
+    path, obj_id = (path, int(number)) if path and number.isdecimal() else (given, None)
+    # BOP's lengths are in mm; what the model's are is seen by its diameter.
+    entry = bop_entry(path, obj_id)
+    scale = (
+        10.0 ** round(np.log10(metrics.diameter(points) / entry["diameter"])) if "diameter" in entry else 1.0
+    )
+    return ibi.Symmetries.from_bop(entry, scale=scale)
 
 
 def _surface(model: Path) -> Any:

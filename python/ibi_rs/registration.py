@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
@@ -248,6 +249,12 @@ class Registration(Sequence[Pose]):
         self.timings = timings
         self.resolution = resolution
         self.params = params
+
+    def canonical(self, symmetries: Symmetries, reference: npt.ArrayLike | None = None) -> Registration:
+        """Return the same with each pose as :meth:`Pose.canonical` gives it."""
+        turned = copy(self)
+        turned.poses = tuple(pose.canonical(symmetries, reference) for pose in self)
+        return turned
 
     def __len__(self) -> int:
         return len(self.poses)
