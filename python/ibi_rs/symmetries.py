@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +83,8 @@ class Symmetries:
 
     discrete: npt.NDArray[np.float64]
     continuous: tuple[Axis, ...]
-    _held: _core.Symmetries = field(repr=False)
+    if TYPE_CHECKING:
+        _held: _core.Symmetries  # what the core takes; no field
 
     def __init__(self, discrete: npt.ArrayLike = (), continuous: Sequence[Any] = ()) -> None:
         axes = [_axis(row, given) for row, given in enumerate(continuous)]
