@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import ibi_rs as ibi
 import numpy as np
 from ibi_rs import synth
 from numpy.typing import NDArray
@@ -38,6 +39,8 @@ class Scan:
         Whether each part that can be seen has a label: elsewhere a pose without one may well be right.
     file : str
         The scan's name there; empty: as here.
+    symmetries : ibi_rs.Symmetries
+        Of the model, as it is in its file.
     """
 
     folder: str
@@ -47,9 +50,14 @@ class Scan:
     feature_voxels: float | None = None
     is_complete: bool = False
     file: str = ""
+    symmetries: ibi.Symmetries = field(default_factory=ibi.Symmetries.none)
 
 
-_TEE = partial(Scan, "real_zju_tee", "model_tee_mesh.ply")
+def _half_turn_about_y(x: float, z: float) -> ibi.Symmetries:
+    return ibi.Symmetries([[[-1, 0, 0, 2 * x], [0, 1, 0, 0], [0, 0, -1, 2 * z], [0, 0, 0, 1]]])
+
+
+_TEE = partial(Scan, "real_zju_tee", "model_tee_mesh.ply", symmetries=_half_turn_about_y(0.017, 0.031))
 _BOX = partial(Scan, "real_provete2", "model_provete2_mesh.ply", "provete2", 0.004, 5)
 SCANS = {
     "tee4": _TEE(None, 0.003, 6, is_complete=True),

@@ -7,6 +7,8 @@ correspondences are real descriptor matches, 4 to 9 % of them right, made once b
 is of one view: at most half of a part can be seen, so the preset `single_view` counts overlap over the model
 points that face the camera, and asks for 0.35 of them. With normals whose sign means nothing, or without any,
 it cannot tell which points those are: the overlap is over the whole model then, and 0.2 of it is asked for.
+What a pose is turned by against its label is what is left modulo the symmetries found on the model: half a
+turn of the tee.
 """
 
 from __future__ import annotations
@@ -50,9 +52,10 @@ def show(scene: str, normals: str, out: Path) -> None:
     given = {} if normals == "none" else {name: data[name] for name in ("src_normals", "tgt_normals")}
     found = ibi.register(src, tgt, corr, PARAMS[normals], viewpoint=data["viewpoint"], **given)
 
+    symmetries = ibi.find_symmetries(src, data["src_normals"])
     labelled = data["poses"].astype(np.float64)
     print(f"{scene}: {len(src)} model points, {len(tgt)} scene points, {len(corr)} correspondences,")
-    print(f"{len(labelled)} parts with a label; lengths in mm")
+    print(f"{len(labelled)} parts with a label; lengths in mm; the model has {symmetries}")
     print()
     print("pose  score  overlap  inliers     x     y     z   nearest label  distance  turned by")
     reached = set()
@@ -60,7 +63,7 @@ def show(scene: str, normals: str, out: Path) -> None:
         # ADD-S: mean distance from the model at the label to the model at the pose, blind to symmetry.
         distances = [metrics.add_s(src, pose.target_from_source, truth) for truth in labelled]
         label = int(np.argmin(distances))
-        turned = metrics.rotation_error_deg(pose.target_from_source, labelled[label])
+        turned = metrics.rotation_error_deg(pose.target_from_source, labelled[label], symmetries=symmetries)
         is_hit = distances[label] < metrics.ADD_S.diameter_fraction * metrics.diameter(src)
         if is_hit:
             reached.add(label)

@@ -11,6 +11,7 @@ from ibi_rs._match import match
 from ibi_rs._register import Model, register
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
+from ibi_rs.symmetries import Symmetries, find_symmetries
 from ibi_rs.variants import (
     Evidence,
     Gsac,
@@ -56,11 +57,13 @@ __all__ = [
     "Round",
     "SacCot",
     "StopReason",
+    "Symmetries",
     "Timings",
     "Verdict",
     "Voting",
     "__version__",
     "features",
+    "find_symmetries",
     "io",
     "match",
     "metrics",

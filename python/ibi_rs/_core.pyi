@@ -10,6 +10,7 @@ __all__ = [
     "InputError",
     "ParamsError",
     "Source",
+    "Symmetries",
     "__version__",
     "check_params",
     "features_dominant_plane",
@@ -35,6 +36,7 @@ __all__ = [
     "params_to_toml",
     "preset",
     "register",
+    "symmetries_find",
 ]
 
 _Floats: TypeAlias = npt.NDArray[np.float64]
@@ -62,7 +64,11 @@ class Source:
     """A source that was checked and prepared."""
 
     def __new__(
-        cls, points: _Floats, normals: _Floats | None = None, frames: _Floats | None = None
+        cls,
+        points: _Floats,
+        normals: _Floats | None = None,
+        frames: _Floats | None = None,
+        symmetries: Symmetries | None = None,
     ) -> Source: ...
     @property
     def spacing(self) -> float: ...
@@ -91,6 +97,21 @@ def register(
     Then of the run: labels (M,) int32, resolution and stop_message; and as JSON text rounds, stop_reason and
     timings.
     """
+
+# Symmetries.
+
+@final
+class Symmetries:
+    """Motions (S, 4, 4), and axes and points of them, (A, 3) each; checked."""
+
+    def __new__(cls, discrete: _Floats, axes: _Floats, offsets: _Floats) -> Symmetries: ...
+    def arrays(self) -> tuple[_Floats, _Floats, _Floats]: ...
+    @property
+    def is_ball(self) -> bool: ...
+    def nearest(self, poses: _Floats, reference: _Floats) -> _Floats: ...
+    def discretised(self, max_step: float) -> _Floats: ...
+
+def symmetries_find(points: _Floats, normals: _Floats | None, tolerance: float) -> Symmetries: ...
 
 # Features.
 
@@ -156,22 +177,32 @@ _Scored: TypeAlias = tuple[
     npt.NDArray[np.bool_],
 ]
 
-def metrics_rotation_error_rad(a: _Floats, b: _Floats) -> float: ...
-def metrics_translation_error(a: _Floats, b: _Floats) -> float: ...
+def metrics_rotation_error_rad(a: _Floats, b: _Floats, symmetries: Symmetries) -> float: ...
+def metrics_translation_error(a: _Floats, b: _Floats, symmetries: Symmetries) -> float: ...
 def metrics_frobenius_distance(a: _Floats, b: _Floats) -> float: ...
 def metrics_add(model: _Floats, predicted: _Floats, truth: _Floats) -> float: ...
 def metrics_add_s(model: _Floats, predicted: _Floats, truth: _Floats) -> float: ...
-def metrics_mssd(model: _Floats, predicted: _Floats, truth: _Floats, symmetries: _Floats) -> float: ...
+def metrics_mssd(model: _Floats, predicted: _Floats, truth: _Floats, symmetries: Symmetries) -> float: ...
 def metrics_diameter(points: _Floats) -> float: ...
 def metrics_assignment(cost: _Floats) -> _Ints: ...
 def metrics_score_pose(
-    predicted: _Floats, truth: _Floats, matching: str, rotation_rad: float, translation: float
+    predicted: _Floats,
+    truth: _Floats,
+    matching: str,
+    rotation_rad: float,
+    translation: float,
+    symmetries: Symmetries,
 ) -> _Scored: ...
 def metrics_score_add_s(
-    predicted: _Floats, truth: _Floats, matching: str, model: _Floats, diameter_fraction: float
+    predicted: _Floats,
+    truth: _Floats,
+    matching: str,
+    model: _Floats,
+    diameter_fraction: float,
+    symmetries: Symmetries,
 ) -> _Scored: ...
 def metrics_mssd_recall(
-    predicted: _Floats, truth: _Floats, matching: str, model: _Floats, symmetries: _Floats
+    predicted: _Floats, truth: _Floats, matching: str, model: _Floats, symmetries: Symmetries
 ) -> tuple[float, _Floats]: ...
 def metrics_mean_score(
     matching: str, counts: Sequence[tuple[int, int, int, int]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from ibi_rs._match import match
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
 from ibi_rs.stages import Run
+from ibi_rs.symmetries import Symmetries, find_symmetries
 
 
 def register(
@@ -146,6 +147,10 @@ class Model:
         Its normals; any length but 0.
     frames : (N, 3, 3) array_like, optional
         Its local reference frames, as in :func:`register`.
+    symmetries : Symmetries, optional
+        What leaves it looking the same. Of two poses found that differ by nothing else (no point of the model
+        by more than 0.05 of its size) the better one is returned, whatever the parameters. By default none,
+        and then none is dropped.
 
     Raises
     ------
@@ -172,11 +177,17 @@ class Model:
         *,
         normals: npt.ArrayLike | None = None,
         frames: npt.ArrayLike | None = None,
+        symmetries: Symmetries | None = None,
     ) -> None:
+        if symmetries is None:
+            symmetries = Symmetries.none()
+        if not isinstance(symmetries, Symmetries):
+            raise TypeError(f"symmetries must be ibi_rs.Symmetries, not {type(symmetries).__name__}")
         points = _points("src", src)
         of_points = None if normals is None else _points("src_normals", normals)
         axes = None if frames is None else _frames("src_frames", frames)
-        self._source = _core.Source(points, of_points, axes)
+        self._source = _core.Source(points, of_points, axes, symmetries._held)
+        self._symmetries = symmetries
         # Copies: the caller's arrays may change, the prepared source does not.
         self._points = _frozen(points.copy())
         self._normals = None if of_points is None else _frozen(of_points.copy())
@@ -190,6 +201,7 @@ class Model:
         faces: npt.ArrayLike | None = None,
         *,
         voxel: float | None = None,
+        symmetries: Symmetries | Literal["find"] | None = None,
         num_threads: int | None = None,
     ) -> Model:
         """Make a model of points on the outer surface of a mesh: a CAD file.
@@ -206,6 +218,9 @@ class Model:
         voxel : float, optional
             Spacing of the points, data units; above 0. By default 1/24 of the diagonal of the mesh. A scan
             should not be much coarser.
+        symmetries : Symmetries or "find", optional
+            As in :class:`Model`; ``"find"`` looks for them on the mesh, by :func:`find_symmetries` on points
+            half a voxel apart, which takes 0.1 to 0.5 s.
         num_threads : int, optional
             As in :func:`register`.
 
@@ -240,9 +255,14 @@ class Model:
             voxel = _number("voxel", voxel)
             if not 0 < voxel < math.inf:
                 raise _core.InputError(f"voxel is {voxel:g}; it must be above 0 and finite")
+        if isinstance(symmetries, str) and symmetries != "find":
+            raise _core.InputError(f"symmetries is {symmetries!r}; it must be 'find' or Symmetries")
         mesh = _points("vertices", vertices), _faces(faces)
         points, normals, voxel = _detect.mesh_points(*mesh, voxel, num_threads)
-        model = cls(points, normals=normals)
+        if symmetries == "find":
+            dense, of_dense, _ = _detect.mesh_points(*mesh, 0.5 * voxel, num_threads)
+            symmetries = find_symmetries(dense, of_dense)
+        model = cls(points, normals=normals, symmetries=symmetries)
         model._voxel = voxel
         return model
 
@@ -260,6 +280,28 @@ class Model:
     def frames(self) -> npt.NDArray[np.float64] | None:
         """(N, 3, 3) as given, or None; read-only."""
         return self._frames
+
+    @property
+    def symmetries(self) -> Symmetries:
+        """What leaves it looking the same, as declared or found when it was made."""
+        return self._symmetries
+
+    def find_symmetries(self, *, tolerance: float = 0.03) -> Symmetries:
+        """Find what leaves it looking the same: :func:`find_symmetries` of its points.
+
+        Nothing of the model changes. ``Model.from_mesh(..., symmetries="find")`` looks more closely, and uses
+        what it finds.
+
+        Parameters
+        ----------
+        tolerance : float, default 0.03
+            As in :func:`find_symmetries`.
+
+        Returns
+        -------
+        Symmetries
+        """
+        return find_symmetries(self._points, self._normals, tolerance=tolerance)
 
     @property
     def spacing(self) -> float:
@@ -285,10 +327,11 @@ class Model:
 
     def __getstate__(self) -> dict[str, Any]:
         state = {"points": self._points, "normals": self._normals, "frames": self._frames}
-        return state | {"voxel": self._voxel}
+        return state | {"voxel": self._voxel, "symmetries": self._symmetries}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        Model.__init__(self, state["points"], normals=state["normals"], frames=state["frames"])
+        arrays = {name: state[name] for name in ("normals", "frames", "symmetries")}
+        Model.__init__(self, state["points"], **arrays)
         self._voxel = state["voxel"]
 
     def correspond(

@@ -20,6 +20,7 @@ import numpy as np
 
 import ibi_rs as ibi
 from ibi_rs import _batch, io, metrics
+from ibi_rs.symmetries import _bop_entry as bop_entry
 
 try:
     import typer
@@ -32,6 +33,8 @@ except ImportError as error:
 FOUND_NOTHING = 3
 """Exit code of `ibi register` where nothing is found; 1: the input is at fault; 2: the command line is."""
 INTERRUPTED = 130
+
+SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has several objects"
 
 PRESETS = {
     "default": ibi.Params,
@@ -74,7 +77,10 @@ FromAllSides = Annotated[
     bool, typer.Option("--from-all-sides", help="SCENE is no depth scan but a whole cloud, with normals.")
 ]
 Voxel = Annotated[
-    float | None, typer.Option(help="Spacing of what is looked at. Default: 1/24 of the model.")
+    float | None,
+    typer.Option(
+        help="Spacing of what is looked at. Default: 1/24 of the model, less where that leaves few points."
+    ),
 ]
 RemovePlane = Annotated[
     bool | None,
@@ -82,6 +88,9 @@ RemovePlane = Annotated[
         "--remove-plane/--keep-plane",
         help="Take the largest plane away, or not. Default: if it looks like a table.",
     ),
+]
+SymmetriesOf = Annotated[
+    str, typer.Option(help=f"{SYMMETRIES}. Of poses that look the same the one turned least is given.")
 ]
 Preset = Annotated[str | None, typer.Option(help=f"{', '.join(PRESETS)}; by default what fits the scene.")]
 ParamsFile = Annotated[Path | None, typer.Option(help="Parameters as TOML or JSON.")]
@@ -103,9 +112,14 @@ class _Search:
     params: ibi.Params | None
     max_instances: int | None
     timeout_s: float | None
+    symmetries: str = "none"
 
     def model(self, path: Path, num_threads: int | None) -> ibi.Model:
-        return ibi.Model.from_mesh(*io.read_mesh(path), voxel=self.voxel, num_threads=num_threads)
+        mesh = io.read_mesh(path)
+        wanted = None if self.symmetries == "find" else _symmetries(self.symmetries, mesh[0])
+        return ibi.Model.from_mesh(
+            *mesh, voxel=self.voxel, symmetries=wanted or "find", num_threads=num_threads
+        )
 
     def sight(self, normals: Any) -> dict[str, Any]:
         """Those arguments of `Model.correspond` that `Model.detect` has, too."""
@@ -140,6 +154,7 @@ def register(
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
     max_instances: MaxInstances = None,
@@ -170,20 +185,23 @@ def register(
     if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
         _fail("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
     chosen = _params(preset, params)
-    search = _Search(viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s)
+    search = _Search(
+        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries
+    )
     options = search.limits(threads)
     pairs: Any = None
     try:
         with err.status("reading") as status:
             tgt, tgt_normals = io.read_cloud(scene)
             if corr is not None:
-                src, _ = io.read_cloud(model)
+                src, src_normals = io.read_cloud(model)
+                held = _symmetries(symmetries, src, src_normals)
                 pairs = _pairs(corr)
                 status.update("registering")
-                found = ibi.register(src, tgt, pairs, chosen, **options)
+                found = ibi.Model(src, symmetries=held).register(tgt, pairs, chosen, **options)
             else:
                 part = search.model(model, threads)
-                src = part.points
+                src, held = part.points, part.symmetries
                 status.update("detecting")
                 found = part.detect(
                     tgt,
@@ -193,7 +211,10 @@ def register(
                     **options,
                 )
         seconds = time.perf_counter() - start
+        found = found.canonical(held)
         _show(found, seconds)
+        if not held.is_none:
+            out.print(f"modulo {held!r}", style="dim", highlight=False)
         if output is not None:
             _write_json(output, _as_dict(found, model, scene, seconds))
         if bop is not None:
@@ -222,6 +243,7 @@ def batch(
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
     max_instances: MaxInstances = None,
@@ -264,7 +286,9 @@ def batch(
     if skip_existing and output is None:
         _fail("--skip-existing looks into the folder of -o; give it")
     chosen = _params(preset, params)
-    search = _Search(viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s)
+    search = _Search(
+        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries
+    )
     start = time.perf_counter()
     try:
         targets = _targets(scenes, output)
@@ -277,6 +301,8 @@ def batch(
 
         def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
             i = new[number]
+            if not isinstance(found, ibi.JobError):
+                found = found.canonical(part.symmetries)
             outcome = _outcome(todo[number], found)
             target = targets[i]
             if target is not None and not isinstance(found, ibi.JobError):
@@ -414,17 +440,42 @@ def evaluate(
     truth: Annotated[Path, typer.Argument(help="True poses: JSON with 'poses', or a (K, 4, 4) NPY.")],
     model: Annotated[Path, typer.Argument(help="Mesh or cloud of the part, for ADD-S and its diameter.")],
     diameters: Annotated[float, typer.Option(help="A pose is right within so many diameters.")] = 0.1,
+    symmetries: Annotated[
+        str | None, typer.Option(help=f"{SYMMETRIES}: adds rotation errors and MSSD, modulo these.")
+    ] = None,
 ) -> None:
     """Score poses against true ones: one to one, by ADD-S below a tenth of the model's diameter."""
     try:
         points = _surface(model)
+        held = _symmetries(symmetries or "none", points)
+        predicted, true = _poses(poses), _poses(truth)
         criterion = metrics.AddS(diameter_fraction=diameters)
-        score = metrics.score_scene(_poses(poses), _poses(truth), criterion=criterion, model=points)
+        score = metrics.score_scene(predicted, true, criterion=criterion, model=points, symmetries=held)
+        mssd = metrics.mssd_recall(predicted, true, model=points, symmetries=held)
     except (ibi.InputError, ImportError, OSError, TypeError, ValueError) as error:
         _fail(error)
     print(f"recall     {score.recall:.3f}  ({score.num_truth_hit} of {score.num_truth})")
     print(f"precision  {score.precision:.3f}  ({score.num_predicted_hit} of {score.num_predicted})")
     print(f"F1         {score.f1:.3f}")
+    if symmetries is not None:
+        turned = [match.rotation_error_deg for match in score.matches if match and match.is_hit]
+        print(f"MSSD       {mssd.average:.3f}  (BOP's average recall, modulo {held!r})")
+        if turned:
+            print(f"turned by  {np.median(turned):.1f} deg in the median, {max(turned):.1f} at most")
+
+
+def _symmetries(given: str, points: Any, normals: Any = None) -> ibi.Symmetries:
+    """Read, find or leave out the symmetries of a model."""
+    if given in ("find", "none"):
+        return ibi.find_symmetries(points, normals) if given == "find" else ibi.Symmetries.none()
+    path, _, number = given.rpartition(":")
+    path, obj_id = (path, int(number)) if path and number.isdecimal() else (given, None)
+    # BOP's lengths are in mm; what the model's are is seen by its diameter.
+    entry = bop_entry(path, obj_id)
+    scale = (
+        10.0 ** round(np.log10(metrics.diameter(points) / entry["diameter"])) if "diameter" in entry else 1.0
+    )
+    return ibi.Symmetries.from_bop(entry, scale=scale)
 
 
 @app.command()

@@ -42,6 +42,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
+from .symmetries import Symmetries, _as_symmetries
 
 __all__ = [
     "ADD_S",
@@ -276,7 +277,9 @@ class MssdRecall:
     recalls: tuple[float, ...]
 
 
-def rotation_error_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+def rotation_error_deg(
+    a: npt.ArrayLike, b: npt.ArrayLike, *, symmetries: Symmetries | npt.ArrayLike | None = None
+) -> float:
     """Angle of the rotation that leads from one pose to the other, in [0, 180] degrees.
 
     Computed through an arc tangent: never NaN, and exact to the last digits near 0 and 180 degrees, where
@@ -286,6 +289,8 @@ def rotation_error_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
     ----------
     a, b : array_like, shape (4, 4)
         Rigid motions.
+    symmetries : Symmetries or array_like of shape (S, 4, 4), optional
+        Of the model: `a` counts as the pose nearest to `b` of those that look like it.
 
     Returns
     -------
@@ -299,10 +304,13 @@ def rotation_error_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
     TypeError
         If an argument is not made of real numbers.
     """
-    return math.degrees(_core.metrics_rotation_error_rad(_pose(a, "a"), _pose(b, "b")))
+    angle = _core.metrics_rotation_error_rad(_pose(a, "a"), _pose(b, "b"), _as_symmetries(symmetries))
+    return math.degrees(angle)
 
 
-def translation_error(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+def translation_error(
+    a: npt.ArrayLike, b: npt.ArrayLike, *, symmetries: Symmetries | npt.ArrayLike | None = None
+) -> float:
     """Distance of the two translations, in the unit of the data.
 
     Depends on where the model's origin lies; centre the model if its origin means nothing.
@@ -311,6 +319,8 @@ def translation_error(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
     ----------
     a, b : array_like, shape (4, 4)
         Rigid motions.
+    symmetries : Symmetries or array_like of shape (S, 4, 4), optional
+        Of the model: `a` counts as the pose nearest to `b` of those that look like it.
 
     Returns
     -------
@@ -323,7 +333,7 @@ def translation_error(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
     TypeError
         If an argument is not made of real numbers.
     """
-    return _core.metrics_translation_error(_pose(a, "a"), _pose(b, "b"))
+    return _core.metrics_translation_error(_pose(a, "a"), _pose(b, "b"), _as_symmetries(symmetries))
 
 
 def frobenius_distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
@@ -428,7 +438,7 @@ def mssd(
     predicted: npt.ArrayLike,
     truth: npt.ArrayLike,
     *,
-    symmetries: npt.ArrayLike | None = None,
+    symmetries: Symmetries | npt.ArrayLike | None = None,
 ) -> float:
     """Largest distance between corresponding model points, under the symmetry that makes it least: MSSD.
 
@@ -438,9 +448,10 @@ def mssd(
         Points of the model, at least one.
     predicted, truth : array_like, shape (4, 4)
         Rigid motions.
-    symmetries : array_like, shape (S, 4, 4), optional
+    symmetries : Symmetries or array_like of shape (S, 4, 4), optional
         Motions of the model, in its frame, that leave it looking the same. The identity is always among
-        them and need not be named.
+        them and need not be named. Turns about an axis are tried in BOP's steps, from the nearest one on; a
+        ball is turned to the truth.
 
     Returns
     -------
@@ -462,7 +473,7 @@ def mssd(
         _points(model, "model"),
         _pose(predicted, "predicted"),
         _pose(truth, "truth"),
-        _poses([] if symmetries is None else symmetries, "symmetries"),
+        _as_symmetries(symmetries),
     )
 
 
@@ -535,6 +546,7 @@ def score_scene(
     matching: Matching = "one_to_one",
     criterion: Criterion = ECC,
     model: npt.ArrayLike | None = None,
+    symmetries: Symmetries | npt.ArrayLike | None = None,
 ) -> SceneScore:
     """Score the poses predicted for one scene against the true ones.
 
@@ -551,6 +563,9 @@ def score_scene(
         What makes a pair a hit.
     model : array_like, shape (N, 3), optional
         Points of the model; needed by `AddS` and by nothing else.
+    symmetries : Symmetries or array_like of shape (S, 4, 4), optional
+        Of the model: against each truth a prediction counts as the pose nearest to it of those that look
+        like it. `AddS` sees to this by itself; of it only the errors of the `PoseMatch` change.
 
     Returns
     -------
@@ -566,17 +581,23 @@ def score_scene(
     """
     _check_matching(matching)
     estimates, truths = _poses(predicted, "predicted"), _poses(truth, "truth")
+    held = _as_symmetries(symmetries)
     if isinstance(criterion, PoseThresholds):
         if model is not None:
             raise ValueError("model must be left out unless criterion is AddS")
         scored = _core.metrics_score_pose(
-            estimates, truths, matching, math.radians(criterion.rotation_deg), float(criterion.translation)
+            estimates,
+            truths,
+            matching,
+            math.radians(criterion.rotation_deg),
+            float(criterion.translation),
+            held,
         )
     elif isinstance(criterion, AddS):
         if model is None:
             raise ValueError("model must be given when criterion is AddS")
         scored = _core.metrics_score_add_s(
-            estimates, truths, matching, _points(model, "model"), float(criterion.diameter_fraction)
+            estimates, truths, matching, _points(model, "model"), float(criterion.diameter_fraction), held
         )
     else:
         raise TypeError(f"criterion must be PoseThresholds or AddS, not {type(criterion).__name__}")
@@ -642,7 +663,7 @@ def mssd_recall(
     truth: npt.ArrayLike,
     *,
     model: npt.ArrayLike,
-    symmetries: npt.ArrayLike | None = None,
+    symmetries: Symmetries | npt.ArrayLike | None = None,
     matching: Matching = "one_to_one",
 ) -> MssdRecall:
     """Part of the true poses found with an MSSD below 0.05, 0.10 .. 0.50 of the model's diameter.
@@ -655,7 +676,7 @@ def mssd_recall(
         True poses.
     model : array_like, shape (N, 3)
         Points of the model, at least one.
-    symmetries : array_like, shape (S, 4, 4), optional
+    symmetries : Symmetries or array_like of shape (S, 4, 4), optional
         As in `mssd`.
     matching : {"one_to_one", "any"}, default "one_to_one"
         As in `score_scene`; one to one by MSSD, before any threshold. BOP instead lets predictions choose
@@ -679,7 +700,7 @@ def mssd_recall(
         _poses(truth, "truth"),
         matching,
         _points(model, "model"),
-        _poses([] if symmetries is None else symmetries, "symmetries"),
+        _as_symmetries(symmetries),
     )
     return MssdRecall(average, tuple(recalls.tolist()))
 

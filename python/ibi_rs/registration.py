@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from ibi_rs.params import Params
+from ibi_rs.symmetries import Symmetries
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +63,23 @@ class Pose:
     def num_inliers(self) -> int:
         """Number of inliers."""
         return len(self.inliers)
+
+    def canonical(self, symmetries: Symmetries, reference: npt.ArrayLike | None = None) -> Pose:
+        """Of the poses that look like this one the one turned least against a reference.
+
+        Parameters
+        ----------
+        symmetries : Symmetries
+            Of the model.
+        reference : (4, 4) array_like, optional
+            As in :meth:`Symmetries.nearest`: by default the identity.
+
+        Returns
+        -------
+        Pose
+            Its measures and ``inliers`` are those of the pose that was found.
+        """
+        return replace(self, target_from_source=symmetries.nearest(self.target_from_source, reference))
 
     def __repr__(self) -> str:
         t = ", ".join(f"{x:.4g}" for x in self.target_from_source[:3, 3])
@@ -230,6 +249,12 @@ class Registration(Sequence[Pose]):
         self.timings = timings
         self.resolution = resolution
         self.params = params
+
+    def canonical(self, symmetries: Symmetries, reference: npt.ArrayLike | None = None) -> Registration:
+        """Return the same with each pose as :meth:`Pose.canonical` gives it."""
+        turned = copy(self)
+        turned.poses = tuple(pose.canonical(symmetries, reference) for pose in self)
+        return turned
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -37,6 +37,7 @@ mod registration;
 mod scene;
 pub mod stages;
 mod state;
+mod symmetries;
 
 pub use claims::{Claims, NearClaims};
 pub use correspondence::{Alive, Correspondences, PointPairs};
@@ -48,3 +49,4 @@ pub use registrar::{Observer, Registrar};
 pub use registration::{Pose, Registration, Round, StopReason, Timings};
 pub use scene::{Cloud, Detail, PreparedCloud, Scene};
 pub use state::State;
+pub use symmetries::{Axis, BOP_STEP, FindSymmetries, Symmetries, SymmetryError, Turning, find_symmetries};

@@ -15,6 +15,7 @@ use crate::kernels::rng::Rng;
 use crate::metrics::diameter;
 use crate::params::Params;
 use crate::stages::Stage;
+use crate::symmetries::Symmetries;
 
 /// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
 #[derive(Debug, Clone, Default)]
@@ -23,6 +24,7 @@ pub struct Cloud<'a> {
     pub(crate) normals: Option<Vec<Vector3<f64>>>,
     pub(crate) viewpoint: Option<Point3<f64>>,
     pub(crate) frames: Option<Vec<Matrix3<f64>>>,
+    pub(crate) symmetries: Symmetries,
 }
 
 impl<'a> Cloud<'a> {
@@ -43,6 +45,14 @@ impl<'a> Cloud<'a> {
     #[must_use]
     pub fn with_frames(mut self, frames: Vec<Matrix3<f64>>) -> Self {
         self.frames = Some(frames);
+        self
+    }
+
+    /// What leaves a source looking the same: of two instances that differ by nothing else the one of the lesser score
+    /// is dropped, whatever the parameters are. Without any, which is the default, nothing is.
+    #[must_use]
+    pub fn with_symmetries(mut self, symmetries: Symmetries) -> Self {
+        self.symmetries = symmetries;
         self
     }
 
@@ -77,6 +87,8 @@ pub struct PreparedCloud<'a> {
     pub frames: Option<Vec<Matrix3<f64>>>,
     /// Where the depth camera stood.
     pub viewpoint: Option<Point3<f64>>,
+    /// What leaves the cloud looking the same, if that was declared.
+    pub symmetries: Symmetries,
     /// Mean distance of a point to its nearest other point, in data units.
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
@@ -139,6 +151,7 @@ impl<'a> PreparedCloud<'a> {
             points: points.clone(),
             frames: cloud.frames.clone(),
             viewpoint: cloud.viewpoint,
+            symmetries: cloud.symmetries.clone(),
             spacing,
             extent,
             centre,
@@ -170,10 +183,19 @@ impl PreparedCloud<'_> {
         (a * self.centre - b * self.centre).norm() + 0.5 * self.extent * a.rotation.angle_to(&b.rotation)
     }
 
+    /// Whether two poses look the same: whether they differ by a declared symmetry and less than [`SAME_INSTANCE`].
+    pub(crate) fn look_the_same(&self, a: &Isometry3<f64>, b: &Isometry3<f64>) -> bool {
+        self.displacement(&self.symmetries.nearest(a, b), b) < SAME_INSTANCE * self.extent
+    }
+
     fn surface(&self, with_normals: bool) -> Surface<'_> {
         Surface { points: &self.points, normals: self.normals.as_deref().filter(|_| with_normals) }
     }
 }
+
+/// Two poses that are one: no point moves farther, in diagonals of the bounding box. Parts cannot lie so close, unless
+/// they are thin plates in a stack.
+const SAME_INSTANCE: f64 = 0.05;
 
 /// How many points stand for a cloud: the mean of so many distances is good to a hundredth.
 const PROBE_POINTS: usize = 256;

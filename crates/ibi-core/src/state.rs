@@ -366,6 +366,7 @@ impl<'a> State<'a> {
         });
         // Stable: equals stay in the order in which they were found.
         measured.sort_by(|(a, _), (b, _)| b.score.total_cmp(&a.score));
+        drop_duplicates(&self.problem.scene, &mut measured);
         let labels = labels(&measured, self.problem.pairs.len());
         self.timings.total_s = self.start.elapsed().as_secs_f64();
         Registration {
@@ -406,6 +407,21 @@ fn measure(problem: &Problem<'_>, params: &Params, found: &Found, support: &Supp
         round: found.round,
     };
     (pose, residuals_sq)
+}
+
+/// Drops what differs from a better pose by a declared symmetry alone; nothing where none is declared.
+fn drop_duplicates(scene: &Scene<'_>, measured: &mut Vec<(Pose, Vec<f64>)>) {
+    if scene.source.symmetries.is_none() {
+        return;
+    }
+    let mut kept: Vec<Isometry3<f64>> = Vec::new();
+    measured.retain(|(Pose { target_from_source: pose, .. }, _)| {
+        let is_new = kept.iter().all(|other| !scene.source.look_the_same(pose, other));
+        if is_new {
+            kept.push(*pose);
+        }
+        is_new
+    });
 }
 
 /// For each correspondence the pose of which it is the closest inlier; the better-ranked one of equals.

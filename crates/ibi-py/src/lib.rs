@@ -5,6 +5,7 @@ mod metrics;
 mod params;
 mod register;
 mod stages;
+mod symmetries;
 
 use pyo3::create_exception;
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
@@ -36,5 +37,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     params::register(m)?;
     register::register(m)?;
     metrics::register(m)?;
-    features::register(m)
+    features::register(m)?;
+    symmetries::register(m)
 }

@@ -16,6 +16,8 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
+use crate::symmetries::Symmetries;
+
 /// How far from a rotation a matrix may be, per entry of R^T R: the rounding of single precision passes, a
 /// scale or a shear does not.
 const RIGID_TOLERANCE: f64 = 1e-6;
@@ -37,8 +39,8 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     Ok(())
 }
 
-type Poses<'py> = PyReadonlyArray3<'py, f64>;
-type Pose<'py> = PyReadonlyArray2<'py, f64>;
+pub(crate) type Poses<'py> = PyReadonlyArray3<'py, f64>;
+pub(crate) type Pose<'py> = PyReadonlyArray2<'py, f64>;
 type Points<'py> = PyReadonlyArray2<'py, f64>;
 
 /// Counts of hits (truth, predicted); recall, precision, F1; then one entry per prediction: the row of its
@@ -54,13 +56,15 @@ type Scored<'py> = (
 );
 
 #[pyfunction]
-fn metrics_rotation_error_rad(a: Pose<'_>, b: Pose<'_>) -> PyResult<f64> {
-    Ok(rotation_error_rad(&pose("a", &a)?, &pose("b", &b)?))
+fn metrics_rotation_error_rad(a: Pose<'_>, b: Pose<'_>, symmetries: &Symmetries) -> PyResult<f64> {
+    let (a, b) = (pose("a", &a)?, pose("b", &b)?);
+    Ok(rotation_error_rad(&symmetries.0.nearest(&a, &b), &b))
 }
 
 #[pyfunction]
-fn metrics_translation_error(a: Pose<'_>, b: Pose<'_>) -> PyResult<f64> {
-    Ok(translation_error(&pose("a", &a)?, &pose("b", &b)?))
+fn metrics_translation_error(a: Pose<'_>, b: Pose<'_>, symmetries: &Symmetries) -> PyResult<f64> {
+    let (a, b) = (pose("a", &a)?, pose("b", &b)?);
+    Ok(translation_error(&symmetries.0.nearest(&a, &b), &b))
 }
 
 #[pyfunction]
@@ -88,12 +92,11 @@ fn metrics_mssd(
     model: Points<'_>,
     predicted: Pose<'_>,
     truth: Pose<'_>,
-    symmetries: Poses<'_>,
+    symmetries: &Symmetries,
 ) -> PyResult<f64> {
     let (points, predicted, truth) =
         (points("model", &model)?, pose("predicted", &predicted)?, pose("truth", &truth)?);
-    let symmetries = poses("symmetries", &symmetries)?;
-    py.detach(|| Ok(Model::new(points)?.mssd(&predicted, &truth, &symmetries))).map_err(to_py)
+    py.detach(|| Ok(Model::new(points)?.mssd(&predicted, &truth, &symmetries.0))).map_err(to_py)
 }
 
 #[pyfunction]
@@ -126,11 +129,14 @@ fn metrics_score_pose<'py>(
     matching: &str,
     rotation_rad: f64,
     translation: f64,
+    symmetries: &Symmetries,
 ) -> PyResult<Scored<'py>> {
     let (predicted, truth) = (poses("predicted", &predicted)?, poses("truth", &truth)?);
     let matching = self::matching(matching)?;
     let criterion = Criterion::Pose(PoseThresholds { rotation_rad, translation });
-    Ok(scored(py, &py.detach(|| metrics::score_scene(&predicted, &truth, matching, &criterion))))
+    let score =
+        py.detach(|| metrics::score_scene_modulo(&predicted, &truth, matching, &criterion, &symmetries.0));
+    Ok(scored(py, &score))
 }
 
 #[pyfunction]
@@ -141,13 +147,14 @@ fn metrics_score_add_s<'py>(
     matching: &str,
     model: Points<'py>,
     diameter_fraction: f64,
+    symmetries: &Symmetries,
 ) -> PyResult<Scored<'py>> {
     let (predicted, truth) = (poses("predicted", &predicted)?, poses("truth", &truth)?);
     let (points, matching) = (points("model", &model)?, self::matching(matching)?);
     let score = py.detach(|| {
         let model = Model::new(points)?;
         let criterion = Criterion::AddS { model: &model, diameter_fraction };
-        Ok(metrics::score_scene(&predicted, &truth, matching, &criterion))
+        Ok(metrics::score_scene_modulo(&predicted, &truth, matching, &criterion, &symmetries.0))
     });
     Ok(scored(py, &score.map_err(to_py)?))
 }
@@ -160,13 +167,14 @@ fn metrics_mssd_recall<'py>(
     truth: Poses<'py>,
     matching: &str,
     model: Points<'py>,
-    symmetries: Poses<'py>,
+    symmetries: &Symmetries,
 ) -> PyResult<(f64, Bound<'py, PyArray1<f64>>)> {
     let (predicted, truth) = (poses("predicted", &predicted)?, poses("truth", &truth)?);
-    let (points, symmetries) = (points("model", &model)?, poses("symmetries", &symmetries)?);
-    let matching = self::matching(matching)?;
+    let (points, matching) = (points("model", &model)?, self::matching(matching)?);
     let found = py
-        .detach(|| Ok(metrics::mssd_recall(&Model::new(points)?, &predicted, &truth, &symmetries, matching)))
+        .detach(|| {
+            Ok(metrics::mssd_recall(&Model::new(points)?, &predicted, &truth, &symmetries.0, matching))
+        })
         .map_err(to_py)?;
     Ok((found.average, found.recalls.to_vec().into_pyarray(py)))
 }
@@ -234,7 +242,7 @@ fn points(name: &str, array: &Points<'_>) -> PyResult<Vec<Point3<f64>>> {
 }
 
 /// (K, 4, 4) to rigid motions.
-fn poses(name: &str, array: &Poses<'_>) -> PyResult<Vec<Isometry3<f64>>> {
+pub(crate) fn poses(name: &str, array: &Poses<'_>) -> PyResult<Vec<Isometry3<f64>>> {
     let matrices = array.as_array();
     let motions = matrices.axis_iter(Axis(0)).enumerate();
     motions
@@ -243,7 +251,7 @@ fn poses(name: &str, array: &Poses<'_>) -> PyResult<Vec<Isometry3<f64>>> {
 }
 
 /// (4, 4) to a rigid motion.
-fn pose(name: &str, array: &Pose<'_>) -> PyResult<Isometry3<f64>> {
+pub(crate) fn pose(name: &str, array: &Pose<'_>) -> PyResult<Isometry3<f64>> {
     rigid_motion(&array.as_array(), || name.to_owned()).map_err(value_error)
 }
 

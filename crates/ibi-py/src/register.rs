@@ -14,6 +14,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::stages::Own;
+use crate::symmetries::Symmetries;
 use crate::{InputError, params, to_py_err};
 
 /// How often a run in the background lets Python look for Ctrl-C.
@@ -31,16 +32,20 @@ struct Source(Arc<PreparedCloud<'static>>);
 #[pymethods]
 impl Source {
     #[new]
-    #[pyo3(signature = (points, normals=None, frames=None))]
+    #[pyo3(signature = (points, normals=None, frames=None, symmetries=None))]
     #[allow(clippy::needless_pass_by_value)] // PyO3 owns
     fn new(
         py: Python<'_>,
         points: PyReadonlyArray2<'_, f64>,
         normals: Option<PyReadonlyArray2<'_, f64>>,
         frames: Option<PyReadonlyArray3<'_, f64>>,
+        symmetries: Option<&Symmetries>,
     ) -> PyResult<Self> {
         let cloud = with_normals(Cloud::from(rows3(&points, Point3::new)?), normals.as_ref())?;
-        let cloud = with_frames(cloud, frames.as_ref())?;
+        let mut cloud = with_frames(cloud, frames.as_ref())?;
+        if let Some(symmetries) = symmetries {
+            cloud = cloud.with_symmetries(symmetries.0.clone());
+        }
         let prepared = py.detach(|| PreparedCloud::source(&cloud)).map_err(|e| to_py_err(&e))?;
         Ok(Self(Arc::new(prepared)))
     }

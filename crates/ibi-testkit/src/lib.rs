@@ -7,6 +7,7 @@ pub mod features;
 pub mod naive;
 mod rng;
 pub mod scenes;
+pub mod shapes;
 pub mod strategies;
 
 pub use rng::Rng;

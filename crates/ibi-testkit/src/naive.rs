@@ -358,3 +358,9 @@ pub fn outward_normals(points: &[Point3<f64>]) -> Vec<Vector3<f64>> {
     };
     points.iter().map(normal).collect()
 }
+
+/// How far the farthest moved point is from the nearest unmoved one: all distances of all.
+#[must_use]
+pub fn farthest_off(points: &[Point3<f64>], motion: &Isometry3<f64>) -> f64 {
+    points.iter().map(|p| nearest_dist_sq(points, &(motion * p)).sqrt()).fold(0.0, f64::max)
+}

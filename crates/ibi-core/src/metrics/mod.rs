@@ -56,7 +56,7 @@ pub use mean_score::{MeanScore, mean_score};
 pub use model::Model;
 pub use mssd_recall::{MSSD_DIAMETER_FRACTIONS, MssdRecall, mssd_recall};
 pub use pose_error::{frobenius_distance, rotation_error_rad, translation_error};
-pub use scene_score::{PoseMatch, SceneScore, score_scene};
+pub use scene_score::{PoseMatch, SceneScore, score_scene, score_scene_modulo};
 
 /// Why a metric has no value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

@@ -2,7 +2,9 @@
 
 use super::{MetricsError, diameter};
 use crate::kernels::neighbors::Neighbors;
+use crate::symmetries::{BOP_STEP, Symmetries, Turning};
 use nalgebra::{Isometry3, Point3};
+use std::borrow::Cow;
 use std::sync::OnceLock;
 
 /// The points of a model, with what its errors need: a kd-tree and the diameter, each made on first use.
@@ -13,6 +15,7 @@ use std::sync::OnceLock;
 /// # Examples
 ///
 /// ```
+/// use ibi_core::Symmetries;
 /// use ibi_core::metrics::Model;
 /// use nalgebra::{Isometry3, Point3, Vector3};
 /// use std::f64::consts::PI;
@@ -23,8 +26,8 @@ use std::sync::OnceLock;
 /// // Each end is 2 from where it belongs, but on the other end: the stick looks right.
 /// assert!((stick.add(&flipped, &truth) - 2.0).abs() < 1e-12);
 /// assert!(stick.add_s(&flipped, &truth) < 1e-12);
-/// assert!(stick.mssd(&flipped, &truth, &[flipped]) < 1e-12);
-/// # Ok::<(), ibi_core::metrics::MetricsError>(())
+/// assert!(stick.mssd(&flipped, &truth, &Symmetries::new(&[flipped], &[])?) < 1e-12);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug)]
 pub struct Model {
@@ -98,8 +101,8 @@ impl Model {
     /// MSSD: the largest distance between a model point under the prediction and the same point under the
     /// truth, for the symmetry of the model under which this is least.
     ///
-    /// `symmetries` are motions of the model, in its frame, that leave it looking the same. The identity is
-    /// always among them and need not be named; give an empty slice for a model without symmetry.
+    /// Turns about an axis are tried in BOP's steps ([`BOP_STEP`]), from the nearest one on; a ball is turned to the
+    /// truth.
     ///
     /// Hodan et al., "BOP challenge 2020 on 6D object localization", ECCV workshops 2020.
     ///
@@ -108,15 +111,14 @@ impl Model {
     /// O(n s) at worst for n points and s symmetries; a symmetry is left at the first point worse than the
     /// best symmetry before it.
     #[must_use]
-    pub fn mssd(
-        &self,
-        predicted: &Isometry3<f64>,
-        truth: &Isometry3<f64>,
-        symmetries: &[Isometry3<f64>],
-    ) -> f64 {
+    pub fn mssd(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>, symmetries: &Symmetries) -> f64 {
+        let (predicted, motions) = match symmetries.turning() {
+            Turning::None => (*predicted, Cow::from(symmetries.discrete())),
+            _ => (symmetries.nearest(predicted, truth), symmetries.listed(BOP_STEP).into()),
+        };
         let difference = predicted.inverse() * truth;
-        let mut least_sq = self.max_dist_sq(&difference, f64::INFINITY);
-        for symmetry in symmetries {
+        let mut least_sq = f64::INFINITY;
+        for symmetry in motions.iter() {
             least_sq = least_sq.min(self.max_dist_sq(&(difference * symmetry), least_sq));
         }
         least_sq.sqrt()
@@ -184,7 +186,7 @@ mod tests {
             let add = model.points().iter().map(|p| (a * p - b * p).norm()).sum::<f64>();
             prop_assert!((model.add(&a, &b) - add / model.points().len() as f64).abs() < 1e-9);
             prop_assert!((model.add_s(&a, &b) - naive_add_s(&model, &a, &b)).abs() < 1e-9);
-            prop_assert!((model.mssd(&a, &b, &symmetries) - naive_mssd(&model, &a, &b, &symmetries)).abs() < 1e-9);
+            prop_assert!((model.mssd(&a, &b, &Symmetries::new(&symmetries, &[]).unwrap()) - naive_mssd(&model, &a, &b, &symmetries)).abs() < 1e-9);
         }
 
         #[test]
@@ -192,21 +194,22 @@ mod tests {
             // The closest point is no farther than the same point, a mean no larger than a maximum.
             let (add, add_s) = (model.add(&a, &b), model.add_s(&a, &b));
             prop_assert!(add_s <= add + 1e-9);
-            prop_assert!(add <= model.mssd(&a, &b, &[]) + 1e-9);
+            prop_assert!(add <= model.mssd(&a, &b, &Symmetries::none()) + 1e-9);
         }
 
         // Moving the scene changes nothing; neither does giving the model in another frame.
         #[test]
         fn invariances(model in models(), a in isometries(), b in isometries(), motion in isometries()) {
             let moved = Model::new(model.points().iter().map(|p| motion.inverse() * p).collect()).unwrap();
+            let none = Symmetries::none();
             let left = (motion * a, motion * b);
             let right = (a * motion, b * motion);
             prop_assert!((model.add(&left.0, &left.1) - model.add(&a, &b)).abs() < 1e-9);
             prop_assert!((model.add_s(&left.0, &left.1) - model.add_s(&a, &b)).abs() < 1e-9);
-            prop_assert!((model.mssd(&left.0, &left.1, &[]) - model.mssd(&a, &b, &[])).abs() < 1e-9);
+            prop_assert!((model.mssd(&left.0, &left.1, &none) - model.mssd(&a, &b, &none)).abs() < 1e-9);
             prop_assert!((moved.add(&right.0, &right.1) - model.add(&a, &b)).abs() < 1e-9);
             prop_assert!((moved.add_s(&right.0, &right.1) - model.add_s(&a, &b)).abs() < 1e-9);
-            prop_assert!((moved.mssd(&right.0, &right.1, &[]) - model.mssd(&a, &b, &[])).abs() < 1e-9);
+            prop_assert!((moved.mssd(&right.0, &right.1, &none) - model.mssd(&a, &b, &none)).abs() < 1e-9);
         }
     }
 
@@ -218,24 +221,25 @@ mod tests {
 
     #[test]
     fn a_square_turned_by_a_quarter_looks_the_same() {
-        let quarter = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
+        let turn = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
+        let quarter = Symmetries::new(&[turn], &[]).unwrap();
         let truth = Isometry3::translation(3.0, 1.0, 0.0);
-        let predicted = truth * quarter;
+        let predicted = truth * turn;
         // Each corner moves along one side, 2; the corner it lands on is where the model has one.
         assert!((square().add(&predicted, &truth) - 2.0).abs() < 1e-12);
         assert!(square().add_s(&predicted, &truth) < 1e-12);
-        assert!((square().mssd(&predicted, &truth, &[]) - 2.0).abs() < 1e-12);
-        assert!(square().mssd(&predicted, &truth, &[quarter]) < 1e-12);
+        assert!((square().mssd(&predicted, &truth, &Symmetries::none()) - 2.0).abs() < 1e-12);
+        assert!(square().mssd(&predicted, &truth, &quarter) < 1e-12);
     }
 
     #[test]
     fn half_a_turn_counts_to_the_far_corner_unless_a_quarter_is_allowed() {
         // Half a turn moves a corner along the diagonal, 2 sqrt(2); a quarter turn of it back leaves a side, 2.
         let predicted = Isometry3::rotation(Vector3::z() * PI);
-        let quarter = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
+        let quarter = Symmetries::new(&[Isometry3::rotation(Vector3::z() * FRAC_PI_2)], &[]).unwrap();
         let truth = Isometry3::identity();
-        assert!((square().mssd(&predicted, &truth, &[]) - 8.0_f64.sqrt()).abs() < 1e-12);
-        assert!((square().mssd(&predicted, &truth, &[quarter]) - 2.0).abs() < 1e-12);
+        assert!((square().mssd(&predicted, &truth, &Symmetries::none()) - 8.0_f64.sqrt()).abs() < 1e-12);
+        assert!((square().mssd(&predicted, &truth, &quarter) - 2.0).abs() < 1e-12);
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use super::scene_score::{distances, recall};
 use super::{Matching, Model, assignment};
+use crate::symmetries::Symmetries;
 use nalgebra::Isometry3;
 
 /// The parts of the diameter at which MSSD recall is taken (Hodan et al., "BOP challenge 2020").
@@ -29,13 +30,15 @@ pub struct MssdRecall {
 /// # Examples
 ///
 /// ```
+/// use ibi_core::Symmetries;
 /// use ibi_core::metrics::{Matching, Model, mssd_recall};
 /// use nalgebra::{Isometry3, Point3};
 ///
 /// let model = Model::new(vec![Point3::new(-0.5, 0.0, 0.0), Point3::new(0.5, 0.0, 0.0)])?;
 /// // Off by 0.22 of the diameter: missed at 0.05 .. 0.20, found at the six thresholds 0.25 .. 0.50.
 /// let predicted = [Isometry3::translation(0.22, 0.0, 0.0)];
-/// let recall = mssd_recall(&model, &predicted, &[Isometry3::identity()], &[], Matching::OneToOne);
+/// let (truth, none) = ([Isometry3::identity()], Symmetries::none());
+/// let recall = mssd_recall(&model, &predicted, &truth, &none, Matching::OneToOne);
 /// assert!((recall.average - 0.6).abs() < 1e-12);
 /// # Ok::<(), ibi_core::metrics::MetricsError>(())
 /// ```
@@ -44,7 +47,7 @@ pub fn mssd_recall(
     model: &Model,
     predicted: &[Isometry3<f64>],
     truth: &[Isometry3<f64>],
-    symmetries: &[Isometry3<f64>],
+    symmetries: &Symmetries,
     matching: Matching,
 ) -> MssdRecall {
     let mssd = distances(predicted, truth, |p, t| model.mssd(p, t, symmetries));
@@ -93,7 +96,7 @@ mod tests {
         // Recalls 0, then seven of 1/3, then two of 2/3: (7 + 2 * 2) / 3 / 10 = 11/30.
         let (predicted, truth) = ([at(0.07), at(10.42), at(23.0)], [at(0.0), at(10.0), at(20.0)]);
         for matching in Matching::ALL {
-            let found = mssd_recall(&stick(), &predicted, &truth, &[], matching);
+            let found = mssd_recall(&stick(), &predicted, &truth, &Symmetries::none(), matching);
             let thirds = found.recalls.map(|recall| (recall * 3.0).round());
             assert_eq!(thirds, [0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 2.0, 2.0]);
             assert!((found.average - 11.0 / 30.0).abs() < 1e-12);
@@ -104,6 +107,7 @@ mod tests {
     fn a_declared_symmetry_forgives_a_flip() {
         let flip = Isometry3::rotation(Vector3::z() * PI);
         let recall = |symmetries: &[_]| {
+            let symmetries = &Symmetries::new(symmetries, &[]).unwrap();
             mssd_recall(&stick(), &[flip], &[Isometry3::identity()], symmetries, Matching::OneToOne).average
         };
         assert_eq!((recall(&[]), recall(&[flip])), (0.0, 1.0));
@@ -112,8 +116,9 @@ mod tests {
     #[test]
     fn one_prediction_serves_two_truths_only_of_any() {
         // 0.201 and 0.099 from the truths. One to one it finds the nearer, from 0.10 on: nine halves of ten.
-        let recall =
-            |matching| mssd_recall(&stick(), &[at(0.201)], &[at(0.0), at(0.3)], &[], matching).average;
+        let recall = |matching| {
+            mssd_recall(&stick(), &[at(0.201)], &[at(0.0), at(0.3)], &Symmetries::none(), matching).average
+        };
         assert!((recall(Matching::OneToOne) - 0.45).abs() < 1e-12);
         // Else the other too, from 0.25 on: six halves more.
         assert!((recall(Matching::Any) - 0.75).abs() < 1e-12);
@@ -123,8 +128,8 @@ mod tests {
     fn where_there_is_nothing() {
         let model = stick();
         for matching in Matching::ALL {
-            assert_eq!(mssd_recall(&model, &[], &[at(0.0)], &[], matching).average, 0.0);
-            assert_eq!(mssd_recall(&model, &[at(0.0)], &[], &[], matching).average, 1.0);
+            assert_eq!(mssd_recall(&model, &[], &[at(0.0)], &Symmetries::none(), matching).average, 0.0);
+            assert_eq!(mssd_recall(&model, &[at(0.0)], &[], &Symmetries::none(), matching).average, 1.0);
         }
     }
 }

@@ -1,6 +1,7 @@
 //! The score of one scene.
 
 use super::{Criterion, Matching, MetricsError, assignment, rotation_error_rad, translation_error};
+use crate::symmetries::Symmetries;
 use nalgebra::Isometry3;
 
 /// The truth a prediction is held against.
@@ -135,9 +136,30 @@ pub fn score_scene(
     matching: Matching,
     criterion: &Criterion<'_>,
 ) -> SceneScore {
-    let distance = distances(predicted, truth, |p, t| criterion.distance(p, t));
+    score_scene_modulo(predicted, truth, matching, criterion, &Symmetries::none())
+}
+
+/// [`score_scene`] of a model that looks the same from several sides: against each truth a prediction counts as the pose
+/// nearest to it of those that look like it ([`Symmetries::nearest`]). ADD-S sees to this by itself: of it only the
+/// errors of the [`PoseMatch`] change.
+#[must_use]
+pub fn score_scene_modulo(
+    predicted: &[Isometry3<f64>],
+    truth: &[Isometry3<f64>],
+    matching: Matching,
+    criterion: &Criterion<'_>,
+    symmetries: &Symmetries,
+) -> SceneScore {
+    let seen = |row: usize, col: usize| match criterion {
+        Criterion::AddS { .. } => predicted[row],
+        Criterion::Pose(_) => symmetries.nearest(&predicted[row], &truth[col]),
+    };
+    let distance: Vec<f64> = (0..predicted.len() * truth.len())
+        .map(|pair| (pair / truth.len(), pair % truth.len()))
+        .map(|(row, col)| criterion.distance(&seen(row, col), &truth[col]))
+        .collect();
     let is_hit = |row: usize, col: usize| {
-        criterion.is_hit(&predicted[row], &truth[col], distance[row * truth.len() + col])
+        criterion.is_hit(&seen(row, col), &truth[col], distance[row * truth.len() + col])
     };
     let partners: Vec<Option<usize>> = match matching {
         Matching::OneToOne => assignment(&distance, predicted.len(), truth.len()),
@@ -154,12 +176,15 @@ pub fn score_scene(
         .iter()
         .enumerate()
         .map(|(row, partner)| {
-            partner.map(|col| PoseMatch {
-                truth: col,
-                rotation_error_rad: rotation_error_rad(&predicted[row], &truth[col]),
-                translation_error: translation_error(&predicted[row], &truth[col]),
-                distance: distance[row * truth.len() + col],
-                is_hit: is_hit(row, col),
+            partner.map(|col| {
+                let nearest = symmetries.nearest(&predicted[row], &truth[col]);
+                PoseMatch {
+                    truth: col,
+                    rotation_error_rad: rotation_error_rad(&nearest, &truth[col]),
+                    translation_error: translation_error(&nearest, &truth[col]),
+                    distance: distance[row * truth.len() + col],
+                    is_hit: is_hit(row, col),
+                }
             })
         })
         .collect();

@@ -1,0 +1,105 @@
+//! Symmetries for Python: numpy in, numpy out. The maths is in `ibi_core`.
+
+// pyo3 hands arguments over by value; a read-only array is a handle, cheap to own.
+#![expect(clippy::needless_pass_by_value)]
+
+use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
+use ibi_core::{Axis, FindSymmetries, SymmetryError, Turning, find_symmetries};
+use numpy::{IntoPyArray, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2};
+use pyo3::prelude::*;
+
+use crate::InputError;
+use crate::metrics::{Pose, Poses, pose, poses};
+use crate::register::{in_background, rows3};
+
+/// Adds the contents of this file to the module.
+pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<Symmetries>()?;
+    m.add_function(wrap_pyfunction!(symmetries_find, m)?)
+}
+
+/// Checked; see `ibi_rs.Symmetries`, which is in front of it.
+#[pyclass(frozen, module = "ibi_rs._core")]
+pub(crate) struct Symmetries(pub(crate) ibi_core::Symmetries);
+
+#[pymethods]
+impl Symmetries {
+    /// Motions (S, 4, 4), and axes and points of them, (A, 3) each.
+    #[new]
+    fn new(
+        discrete: Poses<'_>,
+        axes: PyReadonlyArray2<'_, f64>,
+        offsets: PyReadonlyArray2<'_, f64>,
+    ) -> PyResult<Self> {
+        let discrete = poses("discrete", &discrete)?;
+        let (axes, offsets) = (rows3(&axes, Vector3::new)?, rows3(&offsets, Point3::new)?);
+        let axis = |(direction, point)| Axis { direction, point };
+        let continuous: Vec<Axis> = axes.into_iter().zip(offsets).map(axis).collect();
+        Ok(Self(ibi_core::Symmetries::new(&discrete, &continuous).map_err(to_py)?))
+    }
+
+    /// The motions, the identity first; the axes, and a point of each.
+    #[expect(clippy::type_complexity)] // three arrays
+    fn arrays<'py>(
+        &self,
+        py: Python<'py>,
+    ) -> PyResult<(Bound<'py, PyArray3<f64>>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
+        let continuous = self.0.continuous();
+        let rows = |of: fn(&Axis) -> Vector3<f64>| {
+            let flat: Vec<f64> = continuous.iter().flat_map(|axis| <[f64; 3]>::from(of(axis))).collect();
+            flat.into_pyarray(py).reshape([continuous.len(), 3])
+        };
+        let discrete = matrices(py, self.0.discrete())?;
+        Ok((discrete, rows(|axis| axis.direction)?, rows(|axis| axis.point.coords)?))
+    }
+
+    /// Whether all rotations about a point are among them.
+    #[getter]
+    fn is_ball(&self) -> bool {
+        matches!(self.0.turning(), Turning::Any(_))
+    }
+
+    /// Of the poses that look like each of `poses` the one nearest to the reference.
+    fn nearest<'py>(
+        &self,
+        py: Python<'py>,
+        poses: Poses<'py>,
+        reference: Pose<'py>,
+    ) -> PyResult<Bound<'py, PyArray3<f64>>> {
+        let (poses, reference) = (self::poses("pose", &poses)?, pose("reference", &reference)?);
+        let nearest: Vec<_> = poses.iter().map(|pose| self.0.nearest(pose, &reference)).collect();
+        matrices(py, &nearest)
+    }
+
+    fn discretised<'py>(&self, py: Python<'py>, max_step: f64) -> PyResult<Bound<'py, PyArray3<f64>>> {
+        matrices(py, &self.0.discretised(max_step).map_err(to_py)?)
+    }
+}
+
+#[pyfunction]
+fn symmetries_find(
+    py: Python<'_>,
+    points: PyReadonlyArray2<'_, f64>,
+    normals: Option<PyReadonlyArray2<'_, f64>>,
+    tolerance: f64,
+) -> PyResult<Symmetries> {
+    let points = rows3(&points, Point3::new)?;
+    let normals = normals.map(|normals| rows3(&normals, Vector3::new)).transpose()?;
+    let found = in_background(py, |_, _| {
+        find_symmetries(&points, normals.as_deref(), FindSymmetries { tolerance }).map_err(to_py)
+    })?;
+    Ok(Symmetries(found))
+}
+
+/// nalgebra stores columns, numpy rows.
+fn matrices<'py>(py: Python<'py>, motions: &[Isometry3<f64>]) -> PyResult<Bound<'py, PyArray3<f64>>> {
+    let flat: Vec<f64> = motions
+        .iter()
+        .flat_map(|m| m.to_homogeneous().transpose().iter().copied().collect::<Vec<_>>())
+        .collect();
+    flat.into_pyarray(py).reshape([motions.len(), 4, 4])
+}
+
+fn to_py(error: SymmetryError) -> PyErr {
+    InputError::new_err(error.to_string())
+}
