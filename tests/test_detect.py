@@ -45,12 +45,17 @@ def test_detect_is_correspond_and_register(tee):
     _, scan, _ = example("tee6")
     tgt, tgt_normals, corr, similarity = tee.correspond(scan, viewpoint=CAMERA)
     assert len(tgt) < len(scan)
-    assert corr.shape == (2 * len(tgt), 2)
+    assert corr.shape == (4 * len(tgt), 2)
     assert similarity.shape == (len(corr),)
     np.testing.assert_allclose(np.linalg.norm(tgt_normals, axis=1), 1)
     assert np.einsum("ij,ij->i", tgt_normals, tgt).max() <= 1e-12  # towards the camera
     by_hand = tee.register(
-        tgt, corr, ibi.Params.single_view(), tgt_normals=tgt_normals, similarity=similarity, viewpoint=CAMERA
+        tgt,
+        corr,
+        ibi.Params.single_view(),
+        tgt_normals=tgt_normals,
+        similarity=similarity,
+        viewpoint=ibi.View(CAMERA, scan),
     )
     np.testing.assert_array_equal(tee.detect(scan, viewpoint=CAMERA), by_hand)
 

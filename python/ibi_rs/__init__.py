@@ -9,6 +9,7 @@ from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._detect import Matches
 from ibi_rs._match import match
 from ibi_rs._register import Model, register
+from ibi_rs._view import View
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
 from ibi_rs.symmetries import Symmetries, find_symmetries
@@ -60,6 +61,7 @@ __all__ = [
     "Symmetries",
     "Timings",
     "Verdict",
+    "View",
     "Voting",
     "__version__",
     "features",

@@ -85,6 +85,7 @@ def register(
     tgt_frames: _Floats | None = None,
     similarity: _Floats | None = None,
     viewpoint: Sequence[float] | None = None,
+    measured: _Floats | None = None,
     num_threads: int | None = None,
     on_round: Callable[[str], object] | None = None,
     scs: Callable[..., object] | None = None,

@@ -1,7 +1,7 @@
 """From a mesh and a scan to what `register` wants: the steps behind `Model.from_mesh` and `Model.correspond`.
 
-With these constants every label of the seven scans of benchmarks/detect.py is reached. Diameters of 23 to 30
-voxels do nearly as well; fewer lose parts.
+The constants were chosen on ray-cast piles, tuning half of benchmarks/piles.py, and on the seven scans of
+benchmarks/detect.py.
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ from ibi_rs import _core, features
 
 Floats = npt.NDArray[np.float64]
 
-VOXELS_PER_DIAMETER = 24
+VOXELS_PER_DIAMETER, MAX_VOXELS_PER_DIAMETER = 24, 48
+MIN_MODEL_POINTS = 700
+"""A slender part is thinned less: with 200 points it is not known again."""
 SAMPLES_PER_VOXEL = 2
 VOXELS_PER_SPACING = 1.25
 """Points that were thinned to a voxel are so much nearer than a voxel, on average."""
-NORMAL_VOXELS, NORMAL_NEIGHBORS = 3, 30
+NORMAL_VOXELS, NORMAL_NEIGHBORS = 2, 30
+"""Wider ones round off what is thin."""
 FEATURE_VOXELS, FEATURE_NEIGHBORS = 6, 150
-PER_POINT = 2
+PER_POINT = 4
 """Nearest model points that each scene point is joined to: walls and edges repeat on a part."""
 PLANE_VOXELS = 1.5
 MAX_BEHIND = 0.02
@@ -49,17 +52,26 @@ def mesh_points(
 ) -> tuple[Floats, Floats, float]:
     """Points on the outer surface of a mesh, one a voxel, their normals, and the voxel."""
     features.sample_mesh(vertices, faces, n=1)  # refuses what is no mesh
-    if voxel is None:
-        used = vertices[np.unique(faces)]
-        voxel = float(np.linalg.norm(np.ptp(used, axis=0))) / VOXELS_PER_DIAMETER
-    points, normals = features.sample_mesh(vertices, faces, spacing=voxel / SAMPLES_PER_VOXEL)
-    seen = features.outer_surface(points, normals, vertices, faces, num_threads=num_threads)
-    if not seen.any():
-        raise _core.InputError(
-            "faces: none is seen from outside; they have to be counter-clockwise from there"
-        )
-    src, src_normals = features.voxel_downsample(points[seen], voxel, normals=normals[seen])
-    assert src_normals is not None  # normals were given
+
+    def thinned(voxel: float) -> tuple[Floats, Floats]:
+        points, normals = features.sample_mesh(vertices, faces, spacing=voxel / SAMPLES_PER_VOXEL)
+        seen = features.outer_surface(points, normals, vertices, faces, num_threads=num_threads)
+        if not seen.any():
+            raise _core.InputError(
+                "faces: none is seen from outside; they have to be counter-clockwise from there"
+            )
+        src, src_normals = features.voxel_downsample(points[seen], voxel, normals=normals[seen])
+        assert src_normals is not None  # normals were given
+        return src, src_normals
+
+    if voxel is not None:
+        return *thinned(voxel), voxel
+    used = vertices[np.unique(faces)]
+    voxel = float(np.linalg.norm(np.ptp(used, axis=0))) / VOXELS_PER_DIAMETER
+    src, src_normals = thinned(voxel)
+    if len(src) < MIN_MODEL_POINTS:
+        voxel *= max((len(src) / MIN_MODEL_POINTS) ** 0.5, VOXELS_PER_DIAMETER / MAX_VOXELS_PER_DIAMETER)
+        src, src_normals = thinned(voxel)
     return src, src_normals, voxel
 
 

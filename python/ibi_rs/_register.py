@@ -22,9 +22,9 @@ from ibi_rs._inputs import (
     _number,
     _points,
     _vector,
-    _viewpoint,
 )
 from ibi_rs._match import match
+from ibi_rs._view import View, _camera
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
 from ibi_rs.stages import Run
@@ -42,7 +42,7 @@ def register(
     src_frames: npt.ArrayLike | None = None,
     tgt_frames: npt.ArrayLike | None = None,
     similarity: npt.ArrayLike | None = None,
-    viewpoint: npt.ArrayLike | None = None,
+    viewpoint: npt.ArrayLike | View | None = None,
     num_threads: int | None = None,
     max_instances: int | None = None,
     timeout_s: float | None = None,
@@ -71,9 +71,10 @@ def register(
         How alike the two descriptors of each correspondence are, on any scale; larger is better. Used by
         :class:`Nnsr`, which cannot do without. A good choice is 1 - d1 / d2, with d1 and d2 the distances to
         the nearest and to the second nearest descriptor.
-    viewpoint : (3,) array_like, optional
-        Where the depth camera stood, in the frame of ``tgt``. With normals that count, only source points
-        that face it count in the overlap.
+    viewpoint : (3,) array_like or View, optional
+        Where the depth camera stood, in the frame of ``tgt``; a :class:`View` adds all that it measured. With
+        normals that count and are oriented, only source points that it can see count in the overlap: they
+        face it, no other part of the model hides them, and nothing that it measured lies before them.
     num_threads : int, optional
         Default: the environment variable ``IBI_NUM_THREADS``, else the cores the process may use. The result
         does not depend on it.
@@ -216,8 +217,8 @@ class Model:
         faces : (F, 3) array_like of int
             Rows of ``vertices``, counter-clockwise as seen from outside. Left out where the object has them.
         voxel : float, optional
-            Spacing of the points, data units; above 0. By default 1/24 of the diagonal of the mesh. A scan
-            should not be much coarser.
+            Spacing of the points, data units; above 0. By default 1/24 of the diagonal of the mesh, and less,
+            down to 1/48, where that leaves fewer than 700 points. A scan should not be much coarser.
         symmetries : Symmetries or "find", optional
             As in :class:`Model`; ``"find"`` looks for them on the mesh, by :func:`find_symmetries` on points
             half a voxel apart, which takes 0.1 to 0.5 s.
@@ -339,14 +340,14 @@ class Model:
         tgt: Points,
         *,
         tgt_normals: npt.ArrayLike | None = None,
-        viewpoint: npt.ArrayLike | None = None,
+        viewpoint: npt.ArrayLike | View | None = None,
         remove_plane: bool | None = None,
         num_threads: int | None = None,
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
 
         The scene is thinned to :attr:`voxel`, its table taken away, its normals estimated; both clouds are
-        described by FPFH over 6 voxels, and each scene point is joined to the two model points most like it.
+        described by FPFH over 6 voxels, and each scene point is joined to the four model points most like it.
 
         Parameters
         ----------
@@ -376,7 +377,7 @@ class Model:
             points,
             None if tgt_normals is None else _points("tgt_normals", tgt_normals),
             self._voxel,
-            viewpoint,
+            _camera(viewpoint)[0],
             remove_plane,
             num_threads,
         )
@@ -392,7 +393,7 @@ class Model:
         params: Params | None = None,
         *,
         tgt_normals: npt.ArrayLike | None = None,
-        viewpoint: npt.ArrayLike | None = None,
+        viewpoint: npt.ArrayLike | View | None = None,
         remove_plane: bool | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
@@ -409,9 +410,10 @@ class Model:
             By default ``Params.single_view()`` with a viewpoint and ``Params()`` without one.
         tgt_normals : (N, 3) array_like, optional
             Outwards. By default they are estimated, and face the viewpoint.
-        viewpoint : (3,) array_like
-            Where the depth camera stood, in the frame of ``tgt``: ``[0, 0, 0]`` for most scans. It may be
-            left out where normals are given, for scenes that are seen from all sides.
+        viewpoint : (3,) array_like or View
+            Where the depth camera stood, in the frame of ``tgt``: ``[0, 0, 0]`` for most scans. Where ``tgt``
+            is not all that it measured, a :class:`View` of all. It may be left out where normals are given,
+            for scenes that are seen from all sides.
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
             less than 2 % of the points lie behind it, as the viewpoint sees it.
@@ -446,6 +448,8 @@ class Model:
         )
         if params is None:
             params = Params() if viewpoint is None else Params.single_view()
+        if viewpoint is not None and not isinstance(viewpoint, View):
+            viewpoint = View(viewpoint, tgt)
         return self.register(
             matches.tgt,
             matches.corr,
@@ -468,7 +472,7 @@ class Model:
         tgt_normals: npt.ArrayLike | None = None,
         tgt_frames: npt.ArrayLike | None = None,
         similarity: npt.ArrayLike | None = None,
-        viewpoint: npt.ArrayLike | None = None,
+        viewpoint: npt.ArrayLike | View | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -486,6 +490,7 @@ class Model:
         overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
         params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
 
+        eye, measured = _camera(viewpoint)
         target, pairs, own = _points("tgt", tgt), _correspondences(corr), params._own()
         # Copies the scene for them, so only where there is one.
         run = Run(self._points, target, pairs, params.seed) if own else None
@@ -497,7 +502,8 @@ class Model:
             tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
             tgt_frames=None if tgt_frames is None else _frames("tgt_frames", tgt_frames),
             similarity=None if similarity is None else _vector("similarity", similarity),
-            viewpoint=None if viewpoint is None else _viewpoint(viewpoint),
+            viewpoint=eye,
+            measured=measured,
             num_threads=_num_threads(num_threads),
             on_round=None if callback is None else _on_round(callback),
             **({} if run is None else {name: run.stage(name, stage) for name, stage in own.items()}),

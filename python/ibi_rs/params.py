@@ -32,7 +32,7 @@ from ibi_rs.variants import (
 _P = TypeVar("_P", bound="Params")
 
 
-Refine = Literal["none", "icp"]
+Refine = Literal["none", "icp", "icp_turns"]
 Removal = Literal["dense", "inliers"]
 
 _STAGES: dict[str, tuple[type[Any], ...]] = {
@@ -71,7 +71,7 @@ class Params:
         leaves normals out of both.
     oriented_normals
         Whether the normals are oriented: outwards on the source, towards the camera on the target; then
-        points that face away from a viewpoint count in no overlap. If not, they are compared up to sign.
+        points that cannot be seen from a viewpoint count in no overlap. If not, they are compared up to sign.
     t_s
         t_s: a run ends when fewer seeds than this are found; at least 3.
     scs, ce, te, hv
@@ -81,7 +81,9 @@ class Params:
     refine
         How a hypothesis is polished on the clouds: ``"none"``, or ``"icp"``, iterative closest points,
         point-to-plane where normals count. Of an accepted one the better of before and after stays, and at
-        least ``t_s`` correspondences still agree with it.
+        least ``t_s`` correspondences still agree with it. ``"icp_turns"``: in a scene seen from one side,
+        what is about to become an instance is also turned by right angles about the model's principal axes,
+        and the best of the 24 poses taken.
     n_contest
         A contest lasts this many rounds: at its end the hypotheses that passed validation become instances,
         best value first. 1: each at once, as it is found. At least 1.
@@ -165,9 +167,9 @@ class Params:
         """Return the setting for a scene seen by one depth camera.
 
         Give the normals of both clouds, oriented, and the viewpoint. Not of the paper: all correspondences
-        play, one neighbourhood at a time; a hypothesis is polished on the clouds before its overlap is
-        measured, over the source points that face the camera, with the scene points that no other instance
-        explains; and hypotheses compete before one becomes an instance.
+        play, one neighbourhood at a time; a hypothesis is polished on the clouds before it is judged, by the
+        source points that the camera can see and the scene points that no other instance explains; hypotheses
+        compete before one becomes an instance, and that one is tried the other ways round.
         """
         return cls.from_dict(json.loads(_core.preset("single_view")))
 

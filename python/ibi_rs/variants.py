@@ -277,9 +277,9 @@ class Overlap:
     Parameters
     ----------
     t_overlap
-        The share to exceed, 0 to 1. Of all source points, or of those that face the viewpoint where normals
-        count and there is one. A depth camera sees at most about half of an object: for scenes from one
-        view 0.3 to 0.4.
+        The share to exceed, 0 to 1. Of all source points, or where normals count, are oriented and there is
+        a viewpoint, of those that can be seen from it. Without it a depth camera sees at most about half of
+        an object: for scenes from one view 0.3 to 0.4.
     exclusive
         Whether target points that an accepted instance explains support no later one, so that an instance is
         found once.
@@ -300,7 +300,9 @@ class Evidence:
     """HV ``evidence``: accepts a pose if it is right with a probability of more than ``t_score``.
 
     Judged by how unlikely it is that so many correspondences agree by chance, in this scene, and by how much
-    closer the two clouds lie than chance would put them. The verdict is given in log odds.
+    closer the two clouds lie than chance would put them. The verdict is given in log odds. In a scene seen
+    from one side only what the camera can see counts, and the margin is in proportion to how much of the
+    model a pose explains.
 
     Parameters
     ----------

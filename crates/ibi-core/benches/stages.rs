@@ -212,7 +212,8 @@ fn kernels(c: &mut Criterion) {
         group.bench_function("mae/5000", |b| b.iter(|| mae(black_box(&all), black_box(&pose), 3.0)));
 
         let bare = |points| Surface { points, normals: None };
-        let contact = Contact { distance: 0.15, min_normal_cos: 0.0, oriented: true, viewpoint: None };
+        let contact =
+            Contact { distance: 0.15, min_normal_cos: 0.0, oriented: true, view: None, to_planes: false };
         let (model, whole) = (bare(&scene.source), bare(&scene.target));
         let share = || overlap(&places(&model, &whole, &near, black_box(&pose), &contact));
         let full = share();

@@ -163,6 +163,8 @@ pub enum Argument {
     Similarity,
     /// Where the depth camera stood.
     Viewpoint,
+    /// What it measured.
+    Measured,
 }
 
 impl std::fmt::Display for Argument {
@@ -177,6 +179,7 @@ impl std::fmt::Display for Argument {
             Self::TgtFrames => "tgt_frames",
             Self::Similarity => "similarity",
             Self::Viewpoint => "viewpoint",
+            Self::Measured => "viewpoint.points",
         })
     }
 }

@@ -30,7 +30,7 @@ pub struct Params {
     /// `d_op`: largest distance of overlapping points, in pr. > 0.
     pub d_op_pr: f64,
     /// Least cosine between the normals of an inlier's two points, and of overlapping points; with a viewpoint,
-    /// points that face away from it count in no overlap. `None` leaves normals out of both. -1 to 1.
+    /// points that cannot be seen from it count in no overlap. `None` leaves normals out of both. -1 to 1.
     #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub min_normal_cos: Option<f64>,
     /// Whether the normals are oriented: outwards on the source, towards the camera on the target. If not, they are
@@ -82,6 +82,10 @@ pub enum Refine {
     /// else point-to-point. First on few points, for a glance, then on more; of an accepted hypothesis the better one
     /// of before and after stays. At least `t_s` alive correspondences must still agree.
     Icp,
+    /// The same; and in a scene seen from one side a hypothesis that is about to become an instance is turned about by
+    /// right angles of the source's principal axes, polished, and the best of the 24 poses taken, as parts that look
+    /// alike from several sides are often found the wrong way round.
+    IcpTurns,
 }
 
 /// Which correspondences a round removes.
@@ -166,8 +170,8 @@ impl Params {
     /// For a scene seen by one depth camera. Give the normals of both clouds, oriented, and the viewpoint.
     ///
     /// Not of the paper: all correspondences play, one neighbourhood at a time; a hypothesis is polished on the
-    /// clouds before its overlap is measured, over the source points that face the camera, with the scene points
-    /// that no other instance explains; and hypotheses compete before one becomes an instance.
+    /// clouds before it is judged, by the source points that the camera can see and the scene points that no other
+    /// instance explains; hypotheses compete before one becomes an instance, and that one is tried the other ways round.
     #[must_use]
     pub fn single_view() -> Self {
         Self {
@@ -186,9 +190,9 @@ impl Params {
             }
             .into(),
             te: Irls::default().into(),
-            refine: Refine::Icp,
-            hv: Overlap { t_overlap: 0.35, exclusive: true }.into(),
-            n_contest: 100,
+            refine: Refine::IcpTurns,
+            hv: Evidence { t_sure: 1.0, ..Evidence::default() }.into(),
+            n_contest: 60,
             removal: Removal::Inliers,
             max_rejections: Some(150),
             ..Self::paper_synthetic()

@@ -4,6 +4,8 @@ use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::time::Instant;
 
+use nalgebra::Isometry3;
+
 use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
@@ -11,7 +13,7 @@ use crate::joint::joint_check;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
-use crate::scene::{Cloud, Detail, PreparedCloud, Scene};
+use crate::scene::{Cloud, Detail, PreparedCloud, Scene, check_points};
 use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict};
 use crate::state::{Play, Problem, State, Tried};
 
@@ -23,6 +25,9 @@ const MANY_INLIERS: f64 = 10.0;
 
 /// Poses that move no point farther apart than this are as good as each other.
 const NEGLIGIBLE_PR: f64 = 0.3;
+
+/// A pose at a first glance that is so near to one that has been judged will end up there.
+const SAME_PR: f64 = 2.0;
 
 /// A prepared source, the parameters and the four stages; registers the source to any number of targets.
 ///
@@ -181,9 +186,13 @@ impl<'a> Registrar<'a> {
         }
         let pool = Arc::new(Pool::new(self.num_threads)?);
         let (scene, pairs) = pool.install(|| {
-            let target =
+            let prepared =
                 PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals, Argument::TgtFrames)?;
-            let scene = Scene::new(&self.source, target, &self.params)?;
+            let measured = target.measured.as_deref();
+            if let Some(points) = measured {
+                check_points(points, Argument::Measured)?;
+            }
+            let scene = Scene::new(&self.source, prepared, measured, &self.params)?;
             let pairs = PointPairs::new(correspondences, &scene, self.params.oriented_normals)?;
             Ok::<_, Error>((scene, pairs))
         })?;
@@ -200,6 +209,7 @@ impl<'a> Registrar<'a> {
             Argument::TgtFrames => target.frames.is_some(),
             Argument::Similarity => correspondences.has_similarity(),
             Argument::Viewpoint => target.viewpoint.is_some(),
+            Argument::Measured => target.measured.is_some(),
             Argument::Src | Argument::Tgt | Argument::Corr => true,
         }
     }
@@ -255,6 +265,7 @@ impl<'a> Registrar<'a> {
         let verdict = state.conclude(&self.params, play);
         if verdict.is_some_and(|verdict| verdict.accepted() && self.hv().is_sure(&verdict)) {
             state.measure_candidates(&self.params, self.hv());
+            state.turn_best(&self.params, self.hv());
             state.accept_best(&self.params, f64::NEG_INFINITY);
         }
         if state.rounds_since_settling >= self.params.n_contest {
@@ -308,26 +319,43 @@ impl<'a> Registrar<'a> {
         let judged = estimate.hypothesis.map(|raw| {
             // Many seeds lead to one and the same pose: it is judged once. (A stage of the user's may think otherwise.)
             let before = tried.get(&raw.target_from_source).filter(|_| self.hv.is_none());
-            before.unwrap_or_else(|| self.judge(context, raw, &mut timings))
+            before.unwrap_or_else(|| self.judge(context, tried, raw, &mut timings))
         });
         Play { seeds, dense, estimate, judged, timings }
     }
 
     /// Polishes a hypothesis and validates it. If it has few inliers and a glance shows that it is
     /// hopeless, neither is done to the end.
-    fn judge(&self, context: &Context<'_>, raw: Hypothesis, timings: &mut Timings) -> (Hypothesis, Verdict) {
+    fn judge(
+        &self,
+        context: &Context<'_>,
+        tried: &Tried,
+        raw: Hypothesis,
+        timings: &mut Timings,
+    ) -> (Hypothesis, Verdict) {
         let Timings { refine_s, hv_s, .. } = timings;
         let scene = context.scene;
         let shift = |a: &Hypothesis, b: &Hypothesis| {
             scene.source.displacement(&a.target_from_source, &b.target_from_source) / scene.resolution
         };
-        let is_poor = raw.score < MANY_INLIERS && !scene.is_one_sided(context.params);
+        let is_one_sided = scene.is_one_sided(context.params);
+        let is_poor = raw.score < MANY_INLIERS || is_one_sided;
         let mut rough = raw;
-        if is_poor && let Some(polished) = timed(refine_s, || context.refined(Detail::Glance, raw)) {
+        let polished = if is_poor { timed(refine_s, || context.refined(Detail::Glance, raw)) } else { None };
+        if let Some(polished) = polished {
             rough = polished;
-            if let Some(verdict) = timed(hv_s, || self.hv().glance(context, &rough)) {
-                return (rough, verdict);
+            // In scans most rounds come upon a pose that is known.
+            let is_same = |a: &Isometry3<f64>, b: &Isometry3<f64>| {
+                scene.source.displacement(a, b) < SAME_PR * scene.resolution
+            };
+            if is_one_sided && let Some(judged) = tried.next_to(&rough.target_from_source, is_same) {
+                return judged;
             }
+        }
+        if (polished.is_some() || is_one_sided)
+            && let Some(verdict) = timed(hv_s, || self.hv().glance(context, &rough))
+        {
+            return (rough, verdict);
         }
         let hypothesis = timed(refine_s, || context.refined(Detail::Look, rough)).unwrap_or(raw);
         let verdict = timed(hv_s, || self.hv().validate(context, &hypothesis));
@@ -351,6 +379,7 @@ impl<'a> Registrar<'a> {
         while self.params.max_instances.is_none_or(|limit| state.num_found() < limit) {
             state.measure_candidates(&self.params, self.hv());
             let least = best_value.map_or(f64::NEG_INFINITY, |value: f64| CONTEST_MARGIN * value);
+            state.turn_best(&self.params, self.hv());
             let Some(value) = state.accept_best(&self.params, least) else { break };
             best_value = best_value.or(Some(value));
             num_accepted += 1;

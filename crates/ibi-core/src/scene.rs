@@ -1,17 +1,19 @@
 //! The two clouds and what is known of them: points, normals, viewpoint, what lies near, resolution.
 
 use std::borrow::Cow;
+use std::f64::consts::FRAC_PI_2;
 use std::sync::OnceLock;
 
-use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::checks::{first_not_finite, unit_vectors};
 use crate::error::{Argument, Error};
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::{Nearby, mean_spacing};
 use crate::kernels::neighbors::Neighbors;
-use crate::kernels::overlap::{Contact, Place, Surface, chance_fit, fit, places};
+use crate::kernels::overlap::{Contact, Fit, Place, Surface, chance_fit, fit, own_fit, places};
 use crate::kernels::rng::Rng;
+use crate::kernels::sight::{OwnShadow, RangeImage, View};
 use crate::metrics::diameter;
 use crate::params::Params;
 use crate::stages::Stage;
@@ -23,6 +25,7 @@ pub struct Cloud<'a> {
     pub(crate) points: Cow<'a, [Point3<f64>]>,
     pub(crate) normals: Option<Vec<Vector3<f64>>>,
     pub(crate) viewpoint: Option<Point3<f64>>,
+    pub(crate) measured: Option<Cow<'a, [Point3<f64>]>>,
     pub(crate) frames: Option<Vec<Matrix3<f64>>>,
     pub(crate) symmetries: Symmetries,
 }
@@ -60,6 +63,14 @@ impl<'a> Cloud<'a> {
     #[must_use]
     pub fn with_viewpoint(mut self, viewpoint: Point3<f64>) -> Self {
         self.viewpoint = Some(viewpoint);
+        self
+    }
+
+    /// All that the camera at the viewpoint measured, where the cloud is only a part of it: thinned, or without the
+    /// table. It tells where there is nothing, and what hides what. By default the cloud itself.
+    #[must_use]
+    pub fn with_measured(mut self, points: impl Into<Cow<'a, [Point3<f64>]>>) -> Self {
+        self.measured = Some(points.into());
         self
     }
 }
@@ -103,6 +114,8 @@ pub struct PreparedCloud<'a> {
     scout: Probe,
     diameter: OnceLock<f64>,
     tree: OnceLock<Neighbors>,
+    /// On all points, and on the probe.
+    shadows: OnceLock<[OwnShadow; 2]>,
 }
 
 impl<'a> PreparedCloud<'a> {
@@ -161,6 +174,7 @@ impl<'a> PreparedCloud<'a> {
             normals: unit_normals,
             diameter: OnceLock::new(),
             tree: OnceLock::new(),
+            shadows: OnceLock::new(),
         })
     }
 }
@@ -175,6 +189,29 @@ impl PreparedCloud<'_> {
     /// kd-tree over the points, built when first asked for: for nearest points at any distance.
     pub(crate) fn tree(&self) -> &Neighbors {
         self.tree.get_or_init(|| Neighbors::new(&self.points))
+    }
+
+    /// Which points the cloud itself hides, at a glance those of the probe; worked out when first asked for. `None`
+    /// without normals.
+    fn own_shadow(&self, detail: Detail) -> Option<&OwnShadow> {
+        let normals = self.normals.as_deref()?;
+        let [all, probe] = self.shadows.get_or_init(|| {
+            let all = OwnShadow::new(&self.points, normals, self.spacing);
+            let probe = all.on(&self.probe.rows);
+            [all, probe]
+        });
+        Some(if detail == Detail::Glance { probe } else { all })
+    }
+
+    /// The 23 motions other than none that turn the cloud about its centre by right angles of its principal axes.
+    pub(crate) fn turns(&self) -> Vec<Isometry3<f64>> {
+        let axes = principal_axes(&self.points, &self.centre);
+        let to_centre = Isometry3::from(self.centre);
+        let turn = |right_angles: Rotation3<f64>| {
+            let turn = axes * right_angles * axes.inverse();
+            to_centre * UnitQuaternion::from_rotation_matrix(&turn) * to_centre.inverse()
+        };
+        right_angles().into_iter().skip(1).map(turn).collect()
     }
 
     /// An upper bound of how far two poses move a point of this cloud apart, data units.
@@ -204,6 +241,7 @@ const SCOUT_POINTS: usize = 64;
 /// Points drawn from a cloud, with their normals.
 #[derive(Debug)]
 struct Probe {
+    rows: Vec<u32>,
     points: Vec<Point3<f64>>,
     normals: Option<Vec<Vector3<f64>>>,
 }
@@ -215,6 +253,7 @@ impl Probe {
         Self {
             points: rows.iter().map(|&row| points[row as usize]).collect(),
             normals: normals.map(|normals| rows.iter().map(|&row| normals[row as usize]).collect()),
+            rows,
         }
     }
 
@@ -245,12 +284,15 @@ pub struct Scene<'a> {
     pub near_source: Nearby,
     /// The target points within the same reach.
     pub near_target: Nearby,
+    /// What the camera measured; with oriented normals and a viewpoint.
+    pub measured: Option<RangeImage>,
 }
 
 impl<'a> Scene<'a> {
     pub(crate) fn new(
         source: &'a PreparedCloud<'a>,
         target: PreparedCloud<'a>,
+        measured: Option<&[Point3<f64>]>,
         params: &Params,
     ) -> Result<Self, Error> {
         let (src, tgt) = (Argument::SrcNormals, Argument::TgtNormals);
@@ -282,7 +324,16 @@ impl<'a> Scene<'a> {
         let reach = (2.0 * params.d_op_pr).max(params.t_he_pr) * resolution;
         let (near_source, near_target) =
             (Nearby::new(&source.points, reach), Nearby::new(&target.points, reach));
-        Ok(Self { source, target, resolution, near_source, near_target })
+        let mut scene = Self { source, target, resolution, near_source, near_target, measured: None };
+        if scene.is_one_sided(params)
+            && let Some(eye) = scene.target.viewpoint
+        {
+            // Now, not first from within a parallel map: both are one themselves.
+            scene.source.own_shadow(Detail::Look);
+            let points = measured.unwrap_or(&scene.target.points);
+            scene.measured = RangeImage::new(eye, points, PIXEL_PR * resolution);
+        }
+        Ok(scene)
     }
 }
 
@@ -303,7 +354,7 @@ impl Scene<'_> {
         detail: Detail,
         target_from_source: &Isometry3<f64>,
         is_claimed: impl Fn(u32) -> bool + Sync,
-    ) -> f64 {
+    ) -> Fit {
         let (source, target, contact) = self.probed(params, detail);
         fit(&source, &target, &self.near_target, target_from_source, &contact, is_claimed)
     }
@@ -314,6 +365,17 @@ impl Scene<'_> {
         let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
         let rng = Rng::new(params.seed, 0, Stage::Hv as u32);
         chance_fit(&source, &target, &self.near_target, &contact, rng, CHANCE_SAMPLES)
+    }
+
+    /// The fit that the noise of the target lets a pose have: 1 unless the scene is seen from one side.
+    #[must_use]
+    pub fn best_fit(&self, params: &Params) -> f64 {
+        if !self.is_one_sided(params) {
+            return 1.0;
+        }
+        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let rng = Rng::new(params.seed, 1, Stage::Hv as u32);
+        own_fit(&target, &self.near_target, &contact, rng, CHANCE_SAMPLES)
     }
 
     /// For each of `points` (of the target), given with a key, that lies within `distance_pr` of the moved source: the
@@ -356,10 +418,12 @@ impl Scene<'_> {
     ) -> Isometry3<f64> {
         let (source, target, contact) = self.probed(params, detail);
         let stop = match detail {
-            Detail::Glance => Stop { steps: 8, shift: 0.02 },
+            Detail::Glance => Stop { max_visible: 2 * SCOUT_POINTS, ..Stop::new(10, 0.02) },
             // Point-to-plane may come from far, and comes to rest; point-to-point creeps on.
-            Detail::Look if target.normals.is_some() => Stop { steps: 20, shift: 0.003 },
-            Detail::Look => Stop { steps: 12, shift: 0.003 },
+            Detail::Look => {
+                let steps = if target.normals.is_some() { 20 } else { 12 };
+                Stop { max_visible: PROBE_POINTS, ..Stop::new(steps, 0.003) }
+            }
         };
         icp(&source, &target, &self.near_target, target_from_source, &contact, stop)
     }
@@ -370,30 +434,42 @@ impl Scene<'_> {
         with_normals && params.oriented_normals && self.target.viewpoint.is_some()
     }
 
-    /// A few source points against the target within a reach of 2 `d_op`; all of them if they are seen from one side:
-    /// then few are seen, and they are needed all.
-    fn probed(&self, params: &Params, detail: Detail) -> (Surface<'_>, Surface<'_>, Contact) {
+    /// A few source points against the target within a reach of 2 `d_op`; more if they are seen from one side: then few
+    /// of them can be seen.
+    fn probed(&self, params: &Params, detail: Detail) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
         let (all, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
+        let contact = Contact { view: self.view(params, detail), ..contact };
         let with_normals = params.min_normal_cos.is_some();
-        let source = match detail {
-            _ if self.is_one_sided(params) => all,
-            Detail::Glance => self.source.scout.surface(with_normals),
-            Detail::Look => self.source.probe.surface(with_normals),
+        let [scout, probe] =
+            [&self.source.scout, &self.source.probe].map(|probe| probe.surface(with_normals));
+        let source = match (detail, contact.view) {
+            (Detail::Glance, None) => scout,
+            (Detail::Look, None) | (Detail::Glance, Some(_)) => probe,
+            (Detail::Look, Some(_)) => all,
         };
         (source, target, contact)
     }
 
-    fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact) {
+    fn view(&self, params: &Params, detail: Detail) -> Option<View<'_>> {
+        let eye = self.target.viewpoint.filter(|_| self.is_one_sided(params))?;
+        Some(View { eye, own: self.source.own_shadow(detail), measured: self.measured.as_ref() })
+    }
+
+    fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
         let with_normals = params.min_normal_cos.is_some();
         let contact = Contact {
             distance: distance_pr * self.resolution,
             min_normal_cos: params.min_normal_cos.unwrap_or(-1.0),
             oriented: params.oriented_normals,
-            viewpoint: self.target.viewpoint,
+            view: self.view(params, Detail::Look),
+            to_planes: self.is_one_sided(params),
         };
         (self.source.surface(with_normals), self.target.surface(with_normals), contact)
     }
 }
+
+/// Least width of a pixel of what the camera measured: wider than the errors of a pose, narrower than a part.
+const PIXEL_PR: f64 = 0.6;
 
 /// Enough to know the fit by chance to a hundredth.
 const CHANCE_SAMPLES: usize = 1000;
@@ -443,6 +519,27 @@ fn check_frames(
         Some(row) => Err(Error::NotARotation { argument, row }),
         None => Ok(()),
     }
+}
+
+/// The rotations that map the coordinate axes to each other, none first.
+fn right_angles() -> Vec<Rotation3<f64>> {
+    let angle = |quarters: u32| f64::from(quarters) * FRAC_PI_2;
+    let first = (0..4).map(|i| Rotation3::from_axis_angle(&Vector3::y_axis(), angle(i)));
+    let first = first.chain([1, 3].map(|i| Rotation3::from_axis_angle(&Vector3::x_axis(), angle(i))));
+    first
+        .flat_map(|a| (0..4).map(move |i| a * Rotation3::from_axis_angle(&Vector3::z_axis(), angle(i))))
+        .collect()
+}
+
+/// The principal axes of points about `centre`, as a rotation.
+fn principal_axes(points: &[Point3<f64>], centre: &Point3<f64>) -> Rotation3<f64> {
+    let spread: Matrix3<f64> = points.iter().map(|p| (p - centre) * (p - centre).transpose()).sum();
+    let eigen = spread.try_symmetric_eigen(f64::EPSILON, 100);
+    let mut axes = eigen.map_or_else(Matrix3::identity, |eigen| eigen.eigenvectors);
+    if axes.determinant() < 0.0 {
+        axes.neg_mut();
+    }
+    Rotation3::from_matrix_unchecked(axes)
 }
 
 /// Centre and diagonal of the bounding box.

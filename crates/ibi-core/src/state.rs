@@ -14,13 +14,16 @@ use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::overlap::overlap;
 use crate::kernels::par::{self, Pool};
-use crate::params::{Params, Removal};
+use crate::params::{Params, Refine, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
 use crate::scene::{Detail, Scene};
 use crate::stages::{Chance, Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
 
 /// Fewest correspondences that fix a pose.
 const MIN_CORRESPONDENCES: u32 = 3;
+
+/// How many of the turned poses are looked at closely.
+const NUM_TURNS: usize = 4;
 
 /// A run that has begun: made by [`crate::Registrar::begin`], moved on by [`crate::Registrar::step`].
 #[derive(Debug)]
@@ -82,6 +85,16 @@ impl Tried {
     /// What became of `pose`, if it has been tried.
     pub(crate) fn get(&self, pose: &Isometry3<f64>) -> Option<(Hypothesis, Verdict)> {
         self.0.iter().find(|(tried, _)| tried == pose).map(|&(_, judged)| judged)
+    }
+
+    /// What became of a pose that ended up next to `pose`, moving no point of the source farther than `displacement` says.
+    pub(crate) fn next_to(
+        &self,
+        pose: &Isometry3<f64>,
+        is_same: impl Fn(&Isometry3<f64>, &Isometry3<f64>) -> bool,
+    ) -> Option<(Hypothesis, Verdict)> {
+        let judged = self.0.iter().map(|&(_, judged)| judged);
+        judged.into_iter().find(|(hypothesis, _)| is_same(pose, &hypothesis.target_from_source))
     }
 
     fn add(&mut self, pose: &Isometry3<f64>, judged: (Hypothesis, Verdict)) {
@@ -327,11 +340,45 @@ impl<'a> State<'a> {
         self.candidates = candidates;
     }
 
+    /// The row of the best candidate; of equals that of the earliest round.
+    fn best(&self) -> Option<usize> {
+        let order = |a: &Candidate, b: &Candidate| a.value.total_cmp(&b.value).then(b.round.cmp(&a.round));
+        self.candidates.iter().enumerate().max_by(|(_, a), (_, b)| order(a, b)).map(|(at, _)| at)
+    }
+
+    /// Turns the best candidate about if it fits better that way ([`Refine::IcpTurns`]).
+    pub(crate) fn turn_best(&mut self, params: &Params, hv: &dyn Validate) {
+        let scene = &self.problem.scene;
+        if params.refine != Refine::IcpTurns || !scene.is_one_sided(params) {
+            return;
+        }
+        let Some(at) = self.best() else { return };
+        let Candidate { hypothesis, value, round, .. } = self.candidates[at];
+        let context = self.problem.context(params, round as usize, &self.found);
+        let turns = scene.source.turns();
+        let mut glances = par::map(turns.len(), 1, |i| {
+            let pose = scene.icp(params, Detail::Glance, &(hypothesis.target_from_source * turns[i]));
+            let claims = context.claims.near(&pose);
+            (scene.fit(params, Detail::Glance, &pose, |row| claims.contains(row)).share, pose)
+        });
+        glances.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        let mut best = (value, hypothesis);
+        for (_, pose) in &glances[..NUM_TURNS] {
+            let target_from_source = scene.icp(params, Detail::Look, pose);
+            let turned = Hypothesis { target_from_source, ..hypothesis };
+            let verdict = hv.validate(&context, &turned);
+            if verdict.value > best.0 + 0.0 {
+                best = (verdict.value, turned);
+            }
+        }
+        let candidate = &mut self.candidates[at];
+        (candidate.value, candidate.hypothesis) = best;
+    }
+
     /// Makes an instance of the best candidate, the earlier of equals, if its value is at least `least`; returns
     /// the value.
     pub(crate) fn accept_best(&mut self, params: &Params, least: f64) -> Option<f64> {
-        let order = |a: &Candidate, b: &Candidate| a.value.total_cmp(&b.value).then(b.round.cmp(&a.round));
-        let (at, _) = self.candidates.iter().enumerate().max_by(|(_, a), (_, b)| order(a, b))?;
+        let at = self.best()?;
         if self.candidates[at].value < least {
             return None;
         }

@@ -14,6 +14,7 @@ use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, chance_fit, fit, overlap, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::kernels::rng::Rng;
+use ibi_core::kernels::sight::View;
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_testkit::naive;
 use ibi_testkit::strategies::{point, rigid_motions};
@@ -131,8 +132,8 @@ impl Oriented {
     }
 }
 
-fn contact(distance: f64, oriented: bool) -> Contact {
-    Contact { distance, min_normal_cos: 0.3, oriented, viewpoint: None }
+fn contact(distance: f64, oriented: bool) -> Contact<'static> {
+    Contact { distance, min_normal_cos: 0.3, oriented, view: None, to_planes: false }
 }
 
 /// The fit of `source` to `target`, with normals if they are to count.
@@ -140,13 +141,13 @@ fn fit_of(
     source: &Oriented,
     target: &Oriented,
     pose: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
     claimed: Option<&[bool]>,
     with_normals: bool,
 ) -> f64 {
     let near = Nearby::new(&target.points, contact.distance);
     let is_claimed = |row: u32| claimed.is_some_and(|claimed| claimed[row as usize]);
-    fit(&source.surface(with_normals), &target.surface(with_normals), &near, pose, contact, is_claimed)
+    fit(&source.surface(with_normals), &target.surface(with_normals), &near, pose, contact, is_claimed).mean
 }
 
 proptest! {
@@ -206,12 +207,12 @@ proptest! {
         let target = source.moved(&pose).joined(30, &others);
         let (back, forth) = (source.flipped(&one), target.flipped(&other));
         let near = Nearby::new(&target.points, 1.0);
-        let unoriented = Contact { viewpoint, ..contact(1.0, false) };
+        let unoriented = Contact { view: viewpoint.map(View::from), ..contact(1.0, false) };
         let ask = |source: &Oriented, target: &Oriented, contact: &Contact| {
             let (from, to) = (source.surface(true), target.surface(true));
             (
                 places(&from, &to, &near, &pose, contact),
-                fit(&from, &to, &near, &pose, contact, |_| false).to_bits(),
+                fit(&from, &to, &near, &pose, contact, |_| false).mean.to_bits(),
                 chance_fit(&from, &to, &near, contact, Rng::new(seed, 0, 0), 50).to_bits(),
             )
         };
@@ -220,7 +221,7 @@ proptest! {
             prop_assert_eq!(ask(source, target, &unoriented), plain.clone());
         }
         // Nor is anything hidden: sides are what orientation tells.
-        prop_assert_eq!(ask(&source, &target, &Contact { viewpoint: None, ..unoriented }), plain);
+        prop_assert_eq!(ask(&source, &target, &Contact { view: None, ..unoriented }), plain);
     }
 }
 
@@ -256,7 +257,7 @@ fn fit_looks_at_what_the_viewpoint_sees() {
     };
     let target = Oriented { points: vec![Point3::origin()], normals: vec![Vector3::z()] };
     let seen_from = |z: f64, oriented| {
-        let contact = Contact { viewpoint: Some(Point3::new(0.0, 0.0, z)), ..contact(1.0, oriented) };
+        let contact = Contact { view: Some(View::from(Point3::new(0.0, 0.0, z))), ..contact(1.0, oriented) };
         fit_of(&source, &target, &Isometry3::identity(), &contact, None, true)
     };
     // From above two of three are seen and one of them fits; from below the other one only.
@@ -267,7 +268,7 @@ fn fit_looks_at_what_the_viewpoint_sees() {
 // -------------------------------------------------------------------------------------------------- chance fit
 
 /// `chance_fit` by its definition, with random numbers of our own.
-fn naive_chance_fit(source: &Oriented, target: &Oriented, contact: &Contact, samples: usize) -> f64 {
+fn naive_chance_fit(source: &Oriented, target: &Oriented, contact: &Contact<'_>, samples: usize) -> f64 {
     let mut rng = ibi_testkit::Rng::new(99);
     let one = |_| {
         let [i, about] = [(); 2].map(|()| rng.below(source.points.len()));
@@ -290,7 +291,7 @@ fn chance_fit_is_its_twin_and_the_same_for_any_number_of_threads() {
     let near = Nearby::new(&target.points, 1.5);
     for (reach, oriented) in [(0.5, true), (0.5, false), (1.5, true)] {
         // A viewpoint says nothing about a pose that is not known.
-        let contact = Contact { viewpoint: Some(Point3::origin()), ..contact(reach, oriented) };
+        let contact = Contact { view: Some(View::from(Point3::origin())), ..contact(reach, oriented) };
         let ask = |samples| {
             let rng = Rng::new(3, 0, 3);
             chance_fit(&source.surface(true), &target.surface(true), &near, &contact, rng, samples)

@@ -536,7 +536,8 @@ fn awkward_clouds() -> Vec<Vec<Point3<f64>>> {
 /// The share of `source` on `target`, without normals: the plain overlap.
 fn overlap(source: &[Point3<f64>], target: &[Point3<f64>], pose: &Isometry3<f64>, d_op: f64) -> f64 {
     let bare = |points| Surface { points, normals: None };
-    let contact = Contact { distance: d_op, min_normal_cos: 0.0, oriented: true, viewpoint: None };
+    let contact =
+        Contact { distance: d_op, min_normal_cos: 0.0, oriented: true, view: None, to_planes: false };
     overlap::overlap(&places(&bare(source), &bare(target), &Nearby::new(target, d_op), pose, &contact))
 }
 

@@ -9,8 +9,9 @@ mod oriented;
 use common::Mock;
 use ibi_core::kernels::icp::{Stop, icp};
 use ibi_core::kernels::nearby::Nearby;
-use ibi_core::kernels::overlap::{Contact, Place, Surface, overlap, places};
+use ibi_core::kernels::overlap::{Contact, MIN_FACING_COS, Place, Surface, overlap, places};
 use ibi_core::kernels::par::Pool;
+use ibi_core::kernels::sight::View;
 use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use ibi_core::stages::hv::{Hv, Overlap};
 use ibi_core::stages::scs::LocalGtm;
@@ -24,8 +25,14 @@ use ibi_testkit::strategies::{points, rigid_motions};
 use oriented::{Oriented, clouds};
 use proptest::prelude::*;
 
-fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact {
-    Contact { distance, min_normal_cos: 0.5, oriented: true, viewpoint }
+fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact<'static> {
+    Contact {
+        distance,
+        min_normal_cos: 0.5,
+        oriented: true,
+        view: viewpoint.map(View::from),
+        to_planes: false,
+    }
 }
 
 fn viewpoints() -> impl Strategy<Value = Option<Point3<f64>>> {
@@ -43,11 +50,13 @@ fn check_place(
     place: Place,
     (point, normal): (Point3<f64>, Vector3<f64>),
     target: &Oriented,
-    contact: &Contact,
+    contact: &Contact<'_>,
     oriented: bool,
 ) {
-    let facing = match contact.viewpoint {
-        Some(viewpoint) if oriented => normal.dot(&(viewpoint - point)),
+    let facing = match contact.view {
+        Some(view) if oriented => {
+            normal.dot(&(view.eye - point)) - MIN_FACING_COS * (view.eye - point).norm()
+        }
         _ => f64::INFINITY,
     };
     let nearest = naive::nearest_dist_sq(&target.points, &point).sqrt();
@@ -56,6 +65,7 @@ fn check_place(
     let is_nearest = |row: usize| (target.points[row] - point).norm() <= nearest + UNDECIDED;
     match place {
         Place::Hidden => assert!(facing <= UNDECIDED, "{facing}"),
+        Place::Through => panic!("nothing was measured"),
         Place::Free => {
             let turned_away = |row| is_nearest(row) && cos(row) < contact.min_normal_cos + UNDECIDED;
             assert!(facing > -UNDECIDED, "{facing}");
@@ -132,23 +142,25 @@ fn points_that_face_away_are_hidden_and_count_in_no_overlap() {
 
 /// Ends after so many steps, however small.
 fn after(steps: u32) -> Stop {
-    Stop { steps, shift: 0.0 }
+    Stop::new(steps, 0.0)
 }
 
-/// The cost that `icp` promises never to raise, from its definition.
+/// The cost that `icp` promises never to raise, from its definition: of what can be seen at the start.
 fn cost(
     source: &Surface<'_>,
     target: &Surface<'_>,
     near: &Nearby,
-    pose: &Isometry3<f64>,
-    contact: &Contact,
+    [start, pose]: [&Isometry3<f64>; 2],
+    contact: &Contact<'_>,
 ) -> f64 {
     let d = contact.distance;
-    let squares: Vec<f64> = places(source, target, near, pose, contact)
+    let seen = places(source, target, near, start, contact);
+    let squares: Vec<f64> = places(source, target, near, pose, &Contact { view: None, ..*contact })
         .into_iter()
         .enumerate()
+        .filter(|(i, _)| seen[*i] != Place::Hidden)
         .filter_map(|(i, place)| match place {
-            Place::Hidden => None,
+            Place::Hidden | Place::Through => None,
             Place::Free => Some(d * d),
             Place::On(row) => {
                 let gap = pose * source.points[i] - target.points[row as usize];
@@ -231,7 +243,7 @@ proptest! {
             let (source, target) = (source.surface(oriented), target.surface(oriented));
             let found = icp(&source, &target, &near, &start, &contact, after(steps));
             prop_assert!(is_proper(&found), "{found}");
-            let of = |pose| cost(&source, &target, &near, pose, &contact);
+            let of = |pose| cost(&source, &target, &near, [&start, pose], &contact);
             let (before, after) = (of(&start), of(&found));
             prop_assert!(after <= before * (1.0 + 1e-9) + 1e-12, "{before} before, {after} after");
         }

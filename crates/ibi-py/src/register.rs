@@ -63,7 +63,7 @@ impl Source {
 
 /// See `ibi_rs.register`, which brings its arguments into the shapes and dtypes that are wanted here.
 #[pyfunction(name = "register")]
-#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, tgt_frames=None, similarity=None, viewpoint=None, num_threads=None, on_round=None, scs=None, ce=None, te=None, hv=None))]
+#[pyo3(signature = (source, tgt, corr, params, *, tgt_normals=None, tgt_frames=None, similarity=None, viewpoint=None, measured=None, num_threads=None, on_round=None, scs=None, ce=None, te=None, hv=None))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's keyword arguments; PyO3 owns
 fn register_clouds<'py>(
     py: Python<'py>,
@@ -75,6 +75,7 @@ fn register_clouds<'py>(
     tgt_frames: Option<PyReadonlyArray3<'py, f64>>,
     similarity: Option<PyReadonlyArray1<'py, f64>>,
     viewpoint: Option<[f64; 3]>,
+    measured: Option<PyReadonlyArray2<'py, f64>>,
     num_threads: Option<usize>,
     on_round: Option<Py<PyAny>>,
     scs: Option<Py<PyAny>>,
@@ -90,6 +91,9 @@ fn register_clouds<'py>(
     let mut target = with_frames(target, tgt_frames.as_ref())?;
     if let Some(viewpoint) = viewpoint {
         target = target.with_viewpoint(Point3::from(viewpoint));
+    }
+    if let Some(measured) = measured {
+        target = target.with_measured(rows3(&measured, Point3::new)?);
     }
     let mut correspondences = correspondences(corr)?;
     if let Some(similarity) = similarity {

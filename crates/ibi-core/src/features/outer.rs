@@ -3,7 +3,7 @@
 //! A CAD part is often hollow, or made of bodies that touch; what lies within is in no scan. Rays and not the hidden
 //! point removal of point clouds (Katz et al. 2007), whose answer depends on how dense the points are.
 
-use std::f64::consts::{FRAC_PI_2, PI};
+use std::f64::consts::FRAC_PI_2;
 
 use nalgebra::{Point3, Vector3};
 
@@ -12,6 +12,7 @@ use super::door::{check_points, unit_normals};
 use super::mesh::Mesh;
 use crate::interrupt::CancelToken;
 use crate::kernels::par;
+use crate::kernels::sight::{across, buckets, direction};
 
 /// From where the part is looked at.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -95,15 +96,6 @@ impl Views {
     }
 }
 
-/// One of `count` directions that are evenly spread (the spiral of the golden angle, Vogel 1979).
-fn direction(view: usize, count: usize) -> Vector3<f64> {
-    let golden = PI * (3.0 - 5.0_f64.sqrt());
-    let z = 1.0 - (2 * view + 1) as f64 / count as f64;
-    let (sin, cos) = (golden * view as f64).sin_cos();
-    let r = (1.0 - z * z).sqrt();
-    Vector3::new(r * cos, r * sin, z)
-}
-
 fn bounds(points: &[Point3<f64>]) -> (Point3<f64>, Point3<f64>) {
     let Some(&first) = points.first() else { return (Point3::origin(), Point3::origin()) };
     points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)))
@@ -131,9 +123,8 @@ const MAX_SIDE: usize = 512;
 
 impl Screen {
     fn new(mesh: &Mesh<'_>, origin: Point3<f64>, to_eye: Vector3<f64>, rounding: f64) -> Self {
-        let aside = Vector3::ith(to_eye.iamin(), 1.0);
-        let right = to_eye.cross(&aside).normalize();
-        let axes = [right, to_eye.cross(&right), to_eye];
+        let [right, up] = across(&to_eye);
+        let axes = [right, up, to_eye];
         let vertices: Vec<[f64; 3]> = mesh.vertices.iter().map(|v| on_screen(&axes, origin, v)).collect();
         let faces: Vec<_> = mesh.faces.iter().map(|face| face.map(|vertex| vertices[vertex])).collect();
         let ends = |k: usize| {
@@ -161,26 +152,13 @@ impl Screen {
 
     /// Sorts the faces by the pixels that they may cover.
     fn show(&mut self) {
-        let mut starts = vec![0_u32; self.shape[0] * self.shape[1] + 1];
-        for face in &self.faces {
-            self.pixels(face).for_each(|pixel| starts[pixel + 1] += 1);
-        }
-        for pixel in 1..starts.len() {
-            starts[pixel] += starts[pixel - 1];
-        }
-        let mut next = starts.clone();
-        let mut shown = vec![0; starts[starts.len() - 1] as usize];
-        for (id, face) in (0..).zip(&self.faces) {
-            for pixel in self.pixels(face) {
-                shown[next[pixel] as usize] = id;
-                next[pixel] += 1;
-            }
-        }
-        (self.starts, self.shown) = (starts, shown);
+        let faces = (0..).zip(&self.faces);
+        let covered = faces.flat_map(|(id, face)| self.pixels(face).map(move |pixel| (id, pixel)));
+        (self.starts, self.shown) = buckets(self.shape[0] * self.shape[1], covered);
     }
 
     /// The pixels of the box around a face.
-    fn pixels(&self, face: &[[f64; 3]; 3]) -> impl Iterator<Item = usize> + use<> {
+    fn pixels(&self, face: &[[f64; 3]; 3]) -> impl Iterator<Item = usize> + Clone + use<> {
         let range = |k: usize| {
             let (low, high) =
                 (face[0][k].min(face[1][k]).min(face[2][k]), face[0][k].max(face[1][k]).max(face[2][k]));

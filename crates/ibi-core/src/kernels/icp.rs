@@ -5,7 +5,7 @@ use nalgebra::{Isometry3, Matrix6, Point3, Translation3, UnitQuaternion, Vector3
 
 use super::kabsch::rigid_fit;
 use super::nearby::Nearby;
-use super::overlap::{Contact, Place, Surface, places};
+use super::overlap::{Contact, Place, Surface, places, visible};
 
 /// Largest turn of one step, in radians: beyond it the linearisation is worth nothing.
 const MAX_TURN_RAD: f64 = 0.2;
@@ -22,9 +22,18 @@ pub fn icp(
     target: &Surface<'_>,
     nearby: &Nearby,
     start: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
     stop: Stop,
 ) -> Isometry3<f64> {
+    // What can be seen hardly changes on the way.
+    if let Some(view) = contact.view.filter(|_| contact.oriented && source.normals.is_some()) {
+        let rows = visible(source, &view, start, contact.distance, stop.max_visible);
+        let points: Vec<Point3<f64>> = rows.iter().map(|&row| source.points[row as usize]).collect();
+        let normals: Option<Vec<Vector3<f64>>> =
+            source.normals.map(|normals| rows.iter().map(|&row| normals[row as usize]).collect());
+        let seen = Surface { points: &points, normals: normals.as_deref() };
+        return icp(&seen, target, nearby, start, &Contact { view: None, ..*contact }, stop);
+    }
     let (mut pose, mut best) = (*start, (f64::INFINITY, *start));
     let mut has_come_to_rest = false;
     for step in 0..=stop.steps {
@@ -52,8 +61,18 @@ pub fn icp(
 pub struct Stop {
     /// After so many steps.
     pub steps: u32,
+    /// With a camera: of the source points that it may see at the start, at most so many take part.
+    pub max_visible: usize,
     /// After a step that moves the source by less than this share of the contact distance.
     pub shift: f64,
+}
+
+impl Stop {
+    /// All visible points take part.
+    #[must_use]
+    pub fn new(steps: u32, shift: f64) -> Self {
+        Self { steps, max_visible: usize::MAX, shift }
+    }
 }
 
 /// Whether two poses move the source less than `distance` apart.
@@ -75,7 +94,7 @@ fn cost(
     source: &Surface<'_>,
     target: &Surface<'_>,
     pose: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
     places: &[Place],
 ) -> f64 {
     let distance_sq = contact.distance * contact.distance;
@@ -94,7 +113,7 @@ fn to_planes(
     target: &[Point3<f64>],
     normals: &[Vector3<f64>],
     pose: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
     places: &[Place],
 ) -> Option<Isometry3<f64>> {
     let num = on(places).count();

@@ -23,6 +23,7 @@ pub mod overlap;
 pub mod par;
 pub mod replicator;
 pub mod rng;
+pub mod sight;
 pub(crate) mod simd;
 pub mod triangles;
 pub mod triplets;

@@ -2,12 +2,13 @@
 
 use std::ops::Range;
 
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
 
 use super::graph::up_to_sign;
 use super::nearby::Nearby;
 use super::par;
 use super::rng::Rng;
+use super::sight::{Sight, View};
 
 /// A cloud with its normals, if they are to count.
 #[derive(Debug, Clone, Copy)]
@@ -20,22 +21,27 @@ pub struct Surface<'a> {
 
 /// What it takes for a source point to lie on the target.
 #[derive(Debug, Clone, Copy)]
-pub struct Contact {
+pub struct Contact<'a> {
     /// Largest distance, data units.
     pub distance: f64,
     /// With normals: least cosine between them.
     pub min_normal_cos: f64,
     /// Whether the sign of a normal means something; else the magnitude of the cosine counts.
     pub oriented: bool,
-    /// With oriented normals and a viewpoint: points that face away from it cannot be seen and do not count.
-    pub viewpoint: Option<Point3<f64>>,
+    /// With oriented normals and a camera: points that it cannot see do not count.
+    pub view: Option<View<'a>>,
+    /// Whether distances are taken across the surface of the target.
+    pub to_planes: bool,
 }
 
 /// Where a source point comes to lie.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Place {
-    /// It faces away from the viewpoint.
+    /// The camera cannot see it: it faces away, or is behind another part of the source, or behind something that the
+    /// camera has measured.
     Hidden,
+    /// The camera saw through it: what it measured there lies behind.
+    Through,
     /// No target point is near enough, or the nearest one is turned away.
     Free,
     /// On this row of the target.
@@ -56,7 +62,7 @@ pub fn places(
     target: &Surface<'_>,
     nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
 ) -> Vec<Place> {
     let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
         let mut places = vec![Place::Hidden; rows.len()];
@@ -69,9 +75,18 @@ pub fn places(
     chunks.concat()
 }
 
-/// Mean over the visible source points of max(0, 1 - d / `contact.distance`), d being the distance to the nearest
-/// target point if that is not `claimed` and agrees in its normal; 0 if none is visible. [`overlap`] with a slope
-/// in the place of a step: it tells a snug fit from a loose one.
+/// How closely the source lies on the target, [`overlap`] with a slope in the place of a step: it tells a snug fit from a
+/// loose one.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Fit {
+    /// Mean over the visible source points of max(0, 1 - d / reach), d being how far the point is from the nearest target
+    /// point if that is not claimed and agrees in its normal; 0 if none is visible.
+    pub mean: f64,
+    /// The sum of the same over the number of all source points: how much of the source is explained. 0 to 1.
+    pub share: f64,
+}
+
+/// Measures the [`Fit`] of a pose.
 ///
 /// # Complexity
 /// As [`places`].
@@ -81,85 +96,189 @@ pub fn fit(
     target: &Surface<'_>,
     nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
     is_claimed: impl Fn(u32) -> bool + Sync,
-) -> f64 {
+) -> Fit {
     let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
         let (mut visible, mut sum) = (0_u32, 0.0);
-        each_place(source, target, nearby, target_from_source, contact, rows, |_, place, distance| {
+        each_place(source, target, nearby, target_from_source, contact, rows, |_, place, gap| {
             visible += 1;
             if matches!(place, Place::On(row) if !is_claimed(row)) {
-                sum += 1.0 - distance / contact.distance;
+                sum += contact.closeness(target, place, gap);
             }
         });
         (visible, sum)
     });
     let visible: u32 = chunks.iter().map(|(visible, _)| visible).sum();
-    chunks.iter().map(|(_, sum)| sum).sum::<f64>() / f64::from(visible.max(1))
+    let sum: f64 = chunks.iter().map(|(_, sum)| sum).sum();
+    Fit { mean: sum / f64::from(visible.max(1)), share: sum / source.points.len().max(1) as f64 }
 }
 
-/// The fit of a pose that only chance has put somewhere on the target: the mean of max(0, 1 - d / distance)
-/// over `samples` source points, each turned at random about another one that lies on a target point.
+/// The fit of a pose that only chance has put somewhere on the target: the mean of `samples` source points, each turned at
+/// random about another one that lies on a target point.
 #[must_use]
 pub fn chance_fit(
     source: &Surface<'_>,
     target: &Surface<'_>,
     nearby: &Nearby,
-    contact: &Contact,
+    contact: &Contact<'_>,
     mut rng: Rng,
     samples: usize,
 ) -> f64 {
-    let contact = Contact { viewpoint: None, ..*contact };
+    let contact = Contact { view: None, ..*contact };
     let mut sum = 0.0;
     for _ in 0..samples {
         let [i, about] = [(); 2].map(|()| rng.below(source.points.len()));
         let onto = target.points[rng.below(target.points.len())];
         let rotation = rng.rotation();
         let pose = Isometry3::from_parts((onto - rotation * source.points[about]).into(), rotation);
-        each_place(source, target, nearby, &pose, &contact, i..i + 1, |_, place, distance| {
-            if matches!(place, Place::On(_)) {
-                sum += 1.0 - distance / contact.distance;
-            }
+        each_place(source, target, nearby, &pose, &contact, i..i + 1, |_, place, gap| {
+            sum += contact.closeness(target, place, gap);
         });
     }
     sum / samples.max(1) as f64
 }
 
-/// Tells `found(i, place, distance)` of each visible source point i of `rows`: where it lies, and how far it is from
-/// the target point it lies on.
+/// The fit of the target to itself, each of `samples` points to the nearest other one: no pose fits better than the noise
+/// of the scene lets it. 1 if no point has a neighbour.
+#[must_use]
+pub fn own_fit(
+    target: &Surface<'_>,
+    nearby: &Nearby,
+    contact: &Contact<'_>,
+    mut rng: Rng,
+    samples: usize,
+) -> f64 {
+    let (mut sum, mut count) = (0.0, 0_u32);
+    for _ in 0..samples {
+        let i = rng.below(target.points.len());
+        let gap_to = |row: &u32| target.points[i] - target.points[*row as usize];
+        let others = nearby.within(&target.points[i], contact.distance).filter(|&row| row as usize != i);
+        let nearest = others
+            .min_by(|a, b| gap_to(a).norm_squared().total_cmp(&gap_to(b).norm_squared()).then(a.cmp(b)));
+        if let Some(row) = nearest {
+            let normal = target.normals.map_or_else(Vector3::zeros, |normals| normals[row as usize]);
+            sum += contact.closeness(target, Place::On(row), normal * normal.dot(&gap_to(&row)));
+            count += 1;
+        }
+    }
+    if count == 0 { 1.0 } else { sum / f64::from(count) }
+}
+
+impl Contact<'_> {
+    /// max(0, 1 - d / reach) of a point that lies `gap` from where `place` says; 0 elsewhere. d is the length of the gap and
+    /// the reach the distance; across the surface its part along the normal, and half of that: how far the points of a thinned
+    /// scan lie apart along the surface says nothing.
+    fn closeness(&self, target: &Surface<'_>, place: Place, gap: Vector3<f64>) -> f64 {
+        let Place::On(row) = place else { return 0.0 };
+        match target.normals {
+            Some(normals) if self.to_planes => {
+                let across = normals[row as usize].dot(&gap).abs();
+                let along = (gap.norm_squared() - across * across).max(0.0).sqrt();
+                let aside = (along - self.distance / 3.0).max(0.0);
+                (1.0 - (across + aside) / (0.5 * self.distance)).max(0.0)
+            }
+            _ => 1.0 - gap.norm() / self.distance,
+        }
+    }
+}
+
+/// Tells `found(i, place, gap)` of each visible source point i of `rows`: where it lies, and the way to it from the
+/// target point it lies on.
 fn each_place(
     source: &Surface<'_>,
     target: &Surface<'_>,
     nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
-    contact: &Contact,
+    contact: &Contact<'_>,
     rows: Range<usize>,
-    mut found: impl FnMut(usize, Place, f64),
+    mut found: impl FnMut(usize, Place, Vector3<f64>),
 ) {
     let rotation = target_from_source.rotation.to_rotation_matrix();
     let shift = target_from_source.translation.vector;
-    let facing = contact.viewpoint.filter(|_| contact.oriented).zip(source.normals);
+    let sighted = contact.view.filter(|_| contact.oriented).zip(source.normals);
+    let sighted =
+        sighted.map(|(view, normals)| Sighted::new(view, normals, target_from_source, contact.distance));
     let visible = rows.filter_map(|i| {
         let moved = rotation * source.points[i] + shift;
-        let is_hidden =
-            facing.is_some_and(|(eye, normals)| (rotation * normals[i]).dot(&(eye - moved)) <= 0.0);
-        (!is_hidden).then_some((i, moved))
+        let sight = sighted.as_ref().map_or(Sight::Open, |sighted| sighted.sight(i, &rotation, &moved));
+        (sight != Sight::Hidden).then_some(((i, sight), moved))
     });
     let normals = source.normals.zip(target.normals);
-    nearby.nearest_each(contact.distance, visible, |i, moved, row| {
-        let on =
-            row.map(|row| (row, (moved - target.points[row as usize]).norm())).filter(|&(row, distance)| {
-                let agree = |(n, m): (&[Vector3<f64>], &[Vector3<f64>])| {
-                    up_to_sign((rotation * n[i]).dot(&m[row as usize]), contact.oriented)
-                        >= contact.min_normal_cos
-                };
-                distance <= contact.distance && normals.is_none_or(agree)
-            });
+    nearby.nearest_each(contact.distance, visible, |(i, sight), moved, row| {
+        let gap = |row: u32| moved - target.points[row as usize];
+        let on = row.map(|row| (row, gap(row))).filter(|&(row, gap)| {
+            let agree = |(n, m): (&[Vector3<f64>], &[Vector3<f64>])| {
+                up_to_sign((rotation * n[i]).dot(&m[row as usize]), contact.oriented)
+                    >= contact.min_normal_cos
+            };
+            gap.norm() <= contact.distance && normals.is_none_or(agree)
+        });
         match on {
-            Some((row, distance)) => found(i, Place::On(row), distance),
-            None => found(i, Place::Free, f64::INFINITY),
+            Some((row, gap)) => found(i, Place::On(row), gap),
+            // Where the surface ends the camera sees past it.
+            None if sight == Sight::Through => found(i, Place::Through, Vector3::zeros()),
+            None => found(i, Place::Free, Vector3::zeros()),
         }
     });
+}
+
+/// The camera's view of the source in one pose.
+struct Sighted<'a> {
+    view: View<'a>,
+    normals: &'a [Vector3<f64>],
+    /// Which source points are behind other ones.
+    is_hidden: &'a [bool],
+    tolerance: f64,
+}
+
+/// Least cosine between the normal of a point and the direction to the camera: what is seen from its edge is measured badly
+/// or not at all.
+pub const MIN_FACING_COS: f64 = 0.15;
+
+impl<'a> Sighted<'a> {
+    fn new(
+        view: View<'a>,
+        normals: &'a [Vector3<f64>],
+        target_from_source: &Isometry3<f64>,
+        tolerance: f64,
+    ) -> Self {
+        let is_hidden = view.own.map_or(&[][..], |own| own.from(&view.eye, target_from_source));
+        Self { view, normals, is_hidden, tolerance }
+    }
+
+    fn sight(&self, i: usize, rotation: &Rotation3<f64>, moved: &Point3<f64>) -> Sight {
+        let to_eye = self.view.eye - moved;
+        if (rotation * self.normals[i]).dot(&to_eye) <= MIN_FACING_COS * to_eye.norm()
+            || self.is_hidden.get(i).is_some_and(|&is_hidden| is_hidden)
+        {
+            return Sight::Hidden;
+        }
+        self.view.measured.map_or(Sight::Open, |measured| measured.sight(moved, self.tolerance))
+    }
+}
+
+/// Rows of the source points that a camera may see once the pose has moved them, at most `limit` of them, evenly taken.
+#[must_use]
+pub fn visible(
+    source: &Surface<'_>,
+    view: &View<'_>,
+    target_from_source: &Isometry3<f64>,
+    tolerance: f64,
+    limit: usize,
+) -> Vec<u32> {
+    let all = 0..source.points.len() as u32;
+    let Some(normals) = source.normals else { return all.collect() };
+    let sighted = Sighted::new(*view, normals, target_from_source, tolerance);
+    let rotation = target_from_source.rotation.to_rotation_matrix();
+    let shift = target_from_source.translation.vector;
+    let is_visible = |&row: &u32| {
+        let moved = rotation * source.points[row as usize] + shift;
+        sighted.sight(row as usize, &rotation, &moved) != Sight::Hidden
+    };
+    let rows: Vec<u32> = all.filter(is_visible).collect();
+    let step = rows.len().div_ceil(limit).max(1);
+    rows.into_iter().step_by(step).collect()
 }
 
 /// Share of the visible source points that lie on the target; 0 if none is visible.

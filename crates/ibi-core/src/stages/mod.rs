@@ -197,9 +197,11 @@ impl Context<'_> {
             num_explained: (num_explained as u32 * step).max(num_agreeing as u32),
             num_agreeing: num_agreeing as u32,
             chance: expected / num_explained.max(1) as f64,
-            fit,
+            fit: fit.mean,
+            explained: fit.share,
             back_fit: back_fit / near.len().max(1) as f64,
             chance_fit: chance.fit,
+            best_fit: chance.best_fit,
             one_sided: self.scene.is_one_sided(self.params),
         }
     }
@@ -210,6 +212,7 @@ impl Context<'_> {
         self.chance.get_or_init(|| Chance {
             agreement: self.pairs.chances(self.scene, self.params),
             fit: self.scene.chance_fit(self.params),
+            best_fit: self.scene.best_fit(self.params),
         })
     }
 
@@ -227,7 +230,9 @@ impl Context<'_> {
     pub fn refined(&self, detail: Detail, hypothesis: Hypothesis) -> Option<Hypothesis> {
         let target_from_source = match self.params.refine {
             Refine::None => return None,
-            Refine::Icp => self.scene.icp(self.params, detail, &hypothesis.target_from_source),
+            Refine::Icp | Refine::IcpTurns => {
+                self.scene.icp(self.params, detail, &hypothesis.target_from_source)
+            }
         };
         let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
         let is_supported = support >= self.params.t_s as usize;
@@ -258,6 +263,8 @@ pub(crate) struct Chance {
     agreement: Vec<f32>,
     /// The fit of a pose somewhere on the target.
     fit: f64,
+    /// The fit of the target to itself.
+    best_fit: f64,
 }
 
 /// The stages, as keys of random streams.

@@ -112,12 +112,17 @@ impl Shape {
         let all = Surface { points: &self.points, normals: Some(&self.normals) };
         let polished = |some: &(Vec<Point3<f64>>, Vec<Vector3<f64>>), start, distance, stop| {
             let some = Surface { points: &some.0, normals: Some(&some.1) };
-            let contact =
-                Contact { distance, min_normal_cos: MIN_NORMAL_COS, oriented: false, viewpoint: None };
+            let contact = Contact {
+                distance,
+                min_normal_cos: MIN_NORMAL_COS,
+                oriented: false,
+                view: None,
+                to_planes: false,
+            };
             icp(&some, &all, &self.nearby, start, &contact, stop)
         };
-        let start = polished(&self.rough, start, REACH, Stop { steps: 20, shift: 0.01 });
-        polished(&self.fine, &start, 0.5 * REACH, Stop { steps: 4, shift: 0.005 })
+        let start = polished(&self.rough, start, REACH, Stop::new(20, 0.01));
+        polished(&self.fine, &start, 0.5 * REACH, Stop::new(4, 0.005))
     }
 
     /// How far the moved surface is off the unmoved one, both ways, in diameters: the distance that [`WITHIN`] of the

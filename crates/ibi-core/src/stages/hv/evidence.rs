@@ -1,4 +1,5 @@
 use crate::error::Error;
+use crate::kernels::evidence::Support;
 use crate::params::share;
 use crate::scene::Detail;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
@@ -6,7 +7,8 @@ use crate::stages::{Context, Hypothesis, Validate, Verdict};
 /// `evidence`: accepts a pose if it is right with a probability of more than `t_score`.
 ///
 /// Judged by how unlikely it is that so many correspondences agree by chance, in this scene, and by how much closer
-/// the two clouds lie than chance would put them. The verdict is given in log odds.
+/// the two clouds lie than chance would put them. The verdict is given in log odds. In a scene seen from one side only what the
+/// camera can see counts, and the margin is in proportion to how much of the source a pose explains.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(
     feature = "serde",
@@ -37,25 +39,43 @@ impl Evidence {
     }
 }
 
-/// A glance rejects what falls short by more than this in log odds: four standard deviations of the fit of 64 points.
+/// A glance rejects what falls short by more than this in log odds: four standard deviations of the fit of 64 points, and of
+/// about 100 that can be seen.
 const GLANCE_MARGIN: f64 = 4.0;
+const GLANCE_MARGIN_ONE_SIDED: f64 = 2.0;
+
+/// A camera shows a quarter of a part, give or take.
+const USUALLY_EXPLAINED: f64 = 0.25;
 
 impl Evidence {
-    fn verdict(&self, context: &Context<'_>, detail: Detail, hypothesis: &Hypothesis) -> Verdict {
+    fn validate_at(
+        &self,
+        context: &Context<'_>,
+        detail: Detail,
+        hypothesis: &Hypothesis,
+    ) -> (Support, Verdict) {
         let support = context.support(detail, &hypothesis.target_from_source, self.exclusive);
         // Compared as log odds, in which the best of many sure poses still stands out.
-        Verdict { value: support.log_odds(), threshold: log_odds(self.t_score) }
+        let verdict = Verdict { value: support.log_odds(), threshold: log_odds(self.t_score) };
+        (support, verdict)
     }
 }
 
 impl Validate for Evidence {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        self.verdict(context, Detail::Look, hypothesis)
+        let (support, verdict) = self.validate_at(context, Detail::Look, hypothesis);
+        if !support.one_sided {
+            return verdict;
+        }
+        // One flat face fits in many places. Of two poses the one that explains more of the scene comes first.
+        let Verdict { value, threshold } = verdict;
+        Verdict { value: threshold + (value - threshold) * support.explained / USUALLY_EXPLAINED, threshold }
     }
 
     fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
-        let verdict = self.verdict(context, Detail::Glance, hypothesis);
-        (verdict.value < verdict.threshold - GLANCE_MARGIN).then_some(verdict)
+        let (support, verdict) = self.validate_at(context, Detail::Glance, hypothesis);
+        let margin = if support.one_sided { GLANCE_MARGIN_ONE_SIDED } else { GLANCE_MARGIN };
+        (verdict.value < verdict.threshold - margin).then_some(verdict)
     }
 
     fn is_sure(&self, verdict: &Verdict) -> bool {
