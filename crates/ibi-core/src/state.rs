@@ -87,14 +87,16 @@ impl Tried {
         self.0.iter().find(|(tried, _)| tried == pose).map(|&(_, judged)| judged)
     }
 
-    /// What became of a pose that ended up next to `pose`, moving no point of the source farther than `displacement` says.
+    /// What became of a pose that ended up where `pose` is, as `is_same` has it.
     pub(crate) fn next_to(
         &self,
         pose: &Isometry3<f64>,
         is_same: impl Fn(&Isometry3<f64>, &Isometry3<f64>) -> bool,
     ) -> Option<(Hypothesis, Verdict)> {
-        let judged = self.0.iter().map(|&(_, judged)| judged);
-        judged.into_iter().find(|(hypothesis, _)| is_same(pose, &hypothesis.target_from_source))
+        self.0
+            .iter()
+            .map(|&(_, judged)| judged)
+            .find(|(hypothesis, _)| is_same(pose, &hypothesis.target_from_source))
     }
 
     fn add(&mut self, pose: &Isometry3<f64>, judged: (Hypothesis, Verdict)) {
