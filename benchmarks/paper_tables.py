@@ -367,6 +367,8 @@ def main() -> None:
     usual = all(getattr(args, key) == parser.get_default(key) for key in ("half", "scenes"))
     if args.docs and not usual:
         parser.error("--docs fills in the reporting half with the usual number of scenes")
+    if args.data is not None and not args.data.is_dir():
+        parser.error(f"--data: {args.data} is no folder")
     source = Source(args.half, args.scenes, args.data)
     print(f"{MACHINE}, ibi_rs {ibi.__version__}, {args.half} half, at most {args.scenes} scenes")
 

@@ -170,9 +170,9 @@ def test_a_batch_writes_what_register_does_and_tells_what_failed(scans, tmp_path
 
 def test_ids_of_bop_are_in_the_names_or_counted(tmp_path):
     paths = [tmp_path / name for name in ("000003/000012.png", "000004/a_7.ply")]
-    assert cli._bop_ids(paths) == [(3, 12), (4, 7)]
-    assert cli._bop_ids([tmp_path / "a1.ply", tmp_path / "b1.ply"]) == [(0, 0), (0, 1)]
-    assert cli._bop_ids([tmp_path / "a.ply", tmp_path / "b1.ply"]) == [(0, 0), (0, 1)]
+    assert cli.batch._bop_ids(paths) == [(3, 12), (4, 7)]
+    assert cli.batch._bop_ids([tmp_path / "a1.ply", tmp_path / "b1.ply"]) == [(0, 0), (0, 1)]
+    assert cli.batch._bop_ids([tmp_path / "a.ply", tmp_path / "b1.ply"]) == [(0, 0), (0, 1)]
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_bench_times_each_step(files, tmp_path):
     data = json.loads((tmp_path / "bench.json").read_text())
     assert set(data["threads"]) == {"1", str(data["cores"])}
     for steps in data["threads"].values():
-        whole = [step for step in steps if step not in (*cli.STAGES.values(), "total")]
+        whole = [step for step in steps if step not in (*cli.bench.STAGES.values(), "total")]
         assert whole == (["read", "model", "match", "register"] if files else ["model", "register"])
         for i, total in enumerate(steps["total"]):
             assert total == pytest.approx(sum(steps[step][i] for step in whole))
@@ -267,5 +267,5 @@ def test_rotation_vectors_are_scipys():
     rotations = Rotation.random(200, random_state=0)
     half = Rotation.from_rotvec(np.pi * np.eye(3))
     for rotation in [*rotations, *half, Rotation.identity()]:
-        ours = Rotation.from_rotvec(cli._rotation_vector(rotation.as_matrix()))
+        ours = Rotation.from_rotvec(cli.common._rotation_vector(rotation.as_matrix()))
         assert (ours * rotation.inv()).magnitude() < 1e-7

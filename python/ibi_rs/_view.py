@@ -84,11 +84,9 @@ class View:
         fx, fy, cx, cy = (_number(name, value) for name, value in zip(names, (fx, fy, cx, cy), strict=True))
         if not (fx > 0 and fy > 0):
             raise _core.InputError(f"fx and fy are {fx:g} and {fy:g}; they must be above 0")
-        v, u = np.nonzero(np.isfinite(image) & (image > 0))
-        if len(v) == 0:
+        points = depth_points(image, fx, fy, cx, cy)
+        if len(points) == 0:
             raise _core.InputError("depth: no pixel has one")
-        z = image[v, u]
-        points = np.column_stack([(u - cx) / fx * z, (v - cy) / fy * z, z])
         if target_from_camera is None:
             return cls(np.zeros(3), points)
         motion = np.asarray(_real("target_from_camera", target_from_camera), dtype=np.float64)
@@ -99,6 +97,15 @@ class View:
     def __repr__(self) -> str:
         x, y, z = self.eye
         return f"View({len(self.points)} points from [{x:g}, {y:g}, {z:g}])"
+
+
+def depth_points(
+    image: npt.NDArray[np.float64], fx: float, fy: float, cx: float, cy: float
+) -> npt.NDArray[np.float64]:
+    """Return a point for each pixel with a finite depth above 0, row by row, in the frame of the camera."""
+    v, u = np.nonzero(np.isfinite(image) & (image > 0))
+    z = image[v, u]
+    return np.column_stack([(u - cx) / fx * z, (v - cy) / fy * z, z])
 
 
 def _camera(

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs._core import InputError
+from ibi_rs._view import depth_points
 
 __all__ = ["read_cloud", "read_depth", "read_mesh"]
 
@@ -136,11 +137,12 @@ def read_depth(
     depth = _reading(path, read)
     if depth.ndim != 2:
         raise InputError(f"{path}: a depth image has one channel, this has shape {depth.shape}")
-    v, u = np.nonzero((depth > 0) & (depth < np.iinfo(np.uint16).max))
-    if len(v) == 0:
+    is_measured = (depth > 0) & (depth < np.iinfo(np.uint16).max)
+    z = np.where(is_measured, offset + scale * depth.astype(np.float64), 0)
+    points = depth_points(z, fx, fy, cx, cy)
+    if len(points) == 0:
         raise InputError(f"{path}: no pixel has a depth")
-    z = offset + scale * depth[v, u].astype(np.float64)
-    return np.column_stack([(u - cx) / fx * z, (v - cy) / fy * z, z])
+    return points
 
 
 def _read_trimesh(path: Path) -> npt.NDArray[Any]:

@@ -324,8 +324,8 @@ impl<'a> Registrar<'a> {
         Play { seeds, dense, estimate, judged, timings }
     }
 
-    /// Polishes a hypothesis and validates it. If it has few inliers and a glance shows that it is
-    /// hopeless, neither is done to the end.
+    /// Polishes a hypothesis and validates it. If it has few inliers, or the scene is seen from one side, it gets a
+    /// glance first: neither is done to the end where that shows it to be hopeless, or to be known.
     fn judge(
         &self,
         context: &Context<'_>,

@@ -428,7 +428,7 @@ impl Scene<'_> {
         icp(&source, &target, &self.near_target, target_from_source, &contact, stop)
     }
 
-    /// Whether source points that face away from the viewpoint are left out.
+    /// Whether source points that a camera cannot see are left out.
     pub(crate) fn is_one_sided(&self, params: &Params) -> bool {
         let with_normals = params.min_normal_cos.is_some() && self.source.normals.is_some();
         with_normals && params.oriented_normals && self.target.viewpoint.is_some()

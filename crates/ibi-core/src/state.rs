@@ -369,7 +369,7 @@ impl<'a> State<'a> {
             let target_from_source = scene.icp(params, Detail::Look, pose);
             let turned = Hypothesis { target_from_source, ..hypothesis };
             let verdict = hv.validate(&context, &turned);
-            if verdict.value > best.0 + 0.0 {
+            if verdict.value > best.0 {
                 best = (verdict.value, turned);
             }
         }

@@ -11,8 +11,9 @@ use super::FeatureError;
 use super::door::{check_points, unit_normals};
 use super::mesh::Mesh;
 use crate::interrupt::CancelToken;
+use crate::kernels::grid::buckets;
 use crate::kernels::par;
-use crate::kernels::sight::{across, buckets, direction};
+use crate::kernels::sight::{across, corners, direction};
 
 /// From where the part is looked at.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -127,11 +128,8 @@ impl Screen {
         let axes = [right, up, to_eye];
         let vertices: Vec<[f64; 3]> = mesh.vertices.iter().map(|v| on_screen(&axes, origin, v)).collect();
         let faces: Vec<_> = mesh.faces.iter().map(|face| face.map(|vertex| vertices[vertex])).collect();
-        let ends = |k: usize| {
-            let values = vertices.iter().map(move |v| v[k]);
-            values.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), x| (lo.min(x), hi.max(x)))
-        };
-        let ((left, right), (bottom, top)) = (ends(0), ends(1));
+        let flat: Vec<[f64; 2]> = vertices.iter().map(|&[x, y, _]| [x, y]).collect();
+        let ([left, bottom], [right, top]) = corners(&flat);
         // About as many pixels as faces.
         let side = ((faces.len() as f64).sqrt() as usize).clamp(8, MAX_SIDE);
         let pixel = ((right - left).max(top - bottom) / side as f64).max(f64::MIN_POSITIVE);

@@ -24,7 +24,7 @@ pub struct Support {
     pub chance_fit: f64,
     /// The fit that the noise of the scene lets a right pose have.
     pub best_fit: f64,
-    /// Whether only the source points that face a viewpoint were looked at.
+    /// Whether only the source points that a camera can see were looked at.
     pub one_sided: bool,
 }
 
@@ -88,8 +88,8 @@ impl Support {
 /// part of each object is cut off by a plane. `benchmarks/calibration.py --fit` fits them anew.
 const WHOLE: [f64; 4] = [-26.8, 1.27, 17.45, 18.75];
 
-/// The same for scenes seen from one side. `benchmarks/one_view.py` fits them to the poses of ray-cast piles, of real scans and of
-/// scans of another part, and prints what share of each is right; these are more cautious than the fit, for those who look
-/// for a part that may not be there. Correspondences hardly count: a part found the wrong way round has as many as the
-/// right pose.
+/// The same for scenes seen from one side. `benchmarks/one_view.py` prints what share of the poses of each score is right,
+/// in ray-cast piles, real scans, and scans of another part; these weights are more cautious than its `--fit`, for those
+/// who look for a part that may not be there. Correspondences hardly count: a part found the wrong way round has as many
+/// as the right pose.
 const ONE_SIDED: [f64; 4] = [-5.1, 0.05, 9.7, 0.0];

@@ -58,20 +58,8 @@ impl Grid {
         };
         let cells: Vec<u32> =
             (0..n).map(|i| grid.index(grid.cell(points.each_ref().map(|axis| axis[i]))) as u32).collect();
-        let mut starts = vec![0_u32; grid.shape.iter().product::<usize>() + 1];
-        for &cell in &cells {
-            starts[cell as usize + 1] += 1;
-        }
-        for c in 1..starts.len() {
-            starts[c] += starts[c - 1];
-        }
-        let mut next = starts.clone();
-        let mut order = vec![0; n];
-        for (i, &cell) in (0_u32..).zip(&cells) {
-            order[next[cell as usize] as usize] = i;
-            next[cell as usize] += 1;
-        }
-        (grid.starts, grid.order) = (starts, order);
+        let pairs = (0_u32..).zip(cells.iter().map(|&cell| cell as usize));
+        (grid.starts, grid.order) = buckets(grid.shape.iter().product(), pairs);
         grid
     }
 
@@ -255,4 +243,23 @@ pub(crate) fn bulk(values: &[f32]) -> (f32, f32) {
     let (low, high) = (sample[cut], sample[sample.len() - 1 - cut]);
     let margin = MARGIN * (high - low);
     ((low - margin).max(least), (high + margin).min(most))
+}
+
+/// Sorts (item, bucket) pairs by bucket: where each bucket starts, plus the end, and the items in this order.
+pub(crate) fn buckets(
+    count: usize,
+    pairs: impl Iterator<Item = (u32, usize)> + Clone,
+) -> (Vec<u32>, Vec<u32>) {
+    let mut starts = vec![0_u32; count + 1];
+    pairs.clone().for_each(|(_, bucket)| starts[bucket + 1] += 1);
+    for bucket in 1..starts.len() {
+        starts[bucket] += starts[bucket - 1];
+    }
+    let mut next = starts.clone();
+    let mut items = vec![0; starts[count] as usize];
+    for (item, bucket) in pairs {
+        items[next[bucket] as usize] = item;
+        next[bucket] += 1;
+    }
+    (starts, items)
 }

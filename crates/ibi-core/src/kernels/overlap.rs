@@ -75,12 +75,12 @@ pub fn places(
     chunks.concat()
 }
 
-/// How closely the source lies on the target, [`overlap`] with a slope in the place of a step: it tells a snug fit from a
-/// loose one.
+/// How closely the source lies on the target, [`overlap`] with a slope in the place of a step: it tells a snug fit from
+/// a loose one.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Fit {
-    /// Mean over the visible source points of max(0, 1 - d / reach), d being how far the point is from the nearest target
-    /// point if that is not claimed and agrees in its normal; 0 if none is visible.
+    /// Mean over the visible source points of max(0, 1 - d / reach), d being how far the point is from the nearest
+    /// target point if that is not claimed and agrees in its normal; 0 if none is visible.
     pub mean: f64,
     /// The sum of the same over the number of all source points: how much of the source is explained. 0 to 1.
     pub share: f64,
@@ -114,8 +114,8 @@ pub fn fit(
     Fit { mean: sum / f64::from(visible.max(1)), share: sum / source.points.len().max(1) as f64 }
 }
 
-/// The fit of a pose that only chance has put somewhere on the target: the mean of `samples` source points, each turned at
-/// random about another one that lies on a target point.
+/// The fit of a pose that only chance has put somewhere on the target: the mean of `samples` source points, each turned
+/// at random about another one that lies on a target point.
 #[must_use]
 pub fn chance_fit(
     source: &Surface<'_>,
@@ -139,8 +139,8 @@ pub fn chance_fit(
     sum / samples.max(1) as f64
 }
 
-/// The fit of the target to itself, each of `samples` points to the nearest other one: no pose fits better than the noise
-/// of the scene lets it. 1 if no point has a neighbour.
+/// The fit of the target to itself, each of `samples` points to the nearest other one: no pose fits better than the
+/// noise of the scene lets it. 1 if no point has a neighbour.
 #[must_use]
 pub fn own_fit(
     target: &Surface<'_>,
@@ -166,9 +166,10 @@ pub fn own_fit(
 }
 
 impl Contact<'_> {
-    /// max(0, 1 - d / reach) of a point that lies `gap` from where `place` says; 0 elsewhere. d is the length of the gap and
-    /// the reach the distance; across the surface its part along the normal, and half of that: how far the points of a thinned
-    /// scan lie apart along the surface says nothing.
+    /// max(0, 1 - d / reach) of a point that lies `gap` from where `place` says; 0 elsewhere. d is the length of the
+    /// gap and the reach the distance. Across the surface the reach is half of that, and d the part of the gap along the
+    /// normal, as how far the points of a thinned scan lie apart says nothing; but what lies farther aside than a third
+    /// of the distance lies beyond the end of the surface, and by so much farther.
     fn closeness(&self, target: &Surface<'_>, place: Place, gap: Vector3<f64>) -> f64 {
         let Place::On(row) = place else { return 0.0 };
         match target.normals {
@@ -232,8 +233,8 @@ struct Sighted<'a> {
     tolerance: f64,
 }
 
-/// Least cosine between the normal of a point and the direction to the camera: what is seen from its edge is measured badly
-/// or not at all.
+/// Least cosine between the normal of a point and the direction to the camera: what is seen from its edge is measured
+/// badly or not at all.
 pub const MIN_FACING_COS: f64 = 0.15;
 
 impl<'a> Sighted<'a> {

@@ -5,6 +5,7 @@ use std::f64::consts::PI;
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 
 use super::columns::middle;
+use super::grid::buckets;
 use super::par;
 
 /// One of `count` directions that are evenly spread (the spiral of the golden angle, Vogel 1979).
@@ -47,8 +48,8 @@ const DIRECTIONS: usize = 128;
 
 /// Of points on a surface, how far aside of a line of sight one still hides those behind it, how far before them it
 /// must be (both in spacings), and the least share of that distance by which it rises above their tangent plane: what
-/// goes on in the plane of a slanted surface hides nothing. Against rays cast at ten meshes 3 % of what can be seen is
-/// held to be hidden, and as much that is hidden to be seen; more only where walls are as thin as the spacing.
+/// goes on in the plane of a slanted surface hides nothing. Held against rays cast at meshes this errs most where walls
+/// are as thin as the spacing.
 const ASIDE: f64 = 0.9;
 const BEFORE: f64 = 1.0;
 const RISE: f64 = 0.25;
@@ -96,6 +97,18 @@ impl OwnShadow {
     }
 }
 
+/// Lower and upper corner of the box around places on a screen; infinite if there is none.
+pub(crate) fn corners<'a>(places: impl IntoIterator<Item = &'a [f64; 2]>) -> ([f64; 2], [f64; 2]) {
+    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    for at in places {
+        for k in 0..2 {
+            (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k]));
+        }
+    }
+    (low, high)
+}
+
+/// Which points are behind others, as seen from far away in the direction `to_eye`.
 fn hidden(
     points: &[Point3<f64>],
     normals: &[Vector3<f64>],
@@ -104,12 +117,7 @@ fn hidden(
 ) -> Vec<bool> {
     let [right, up] = across(to_eye);
     let on_screen: Vec<[f64; 2]> = points.iter().map(|p| [right.dot(&p.coords), up.dot(&p.coords)]).collect();
-    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-    for at in &on_screen {
-        for k in 0..2 {
-            (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k]));
-        }
-    }
+    let (low, high) = corners(&on_screen);
     let aside = ASIDE * spacing;
     let size = (high[0] - low[0]).max(high[1] - low[1]);
     let cell = aside.max(size / MAX_CELLS).max(f64::MIN_POSITIVE);
@@ -137,25 +145,6 @@ fn hidden(
         })
     };
     (0..points.len()).map(|p| normals[p].dot(to_eye) > 0.0 && is_hidden(p)).collect()
-}
-
-/// Sorts (item, bucket) pairs by bucket: where each bucket starts, plus the end, and the items in this order.
-pub(crate) fn buckets(
-    count: usize,
-    pairs: impl Iterator<Item = (u32, usize)> + Clone,
-) -> (Vec<u32>, Vec<u32>) {
-    let mut starts = vec![0_u32; count + 1];
-    pairs.clone().for_each(|(_, bucket)| starts[bucket + 1] += 1);
-    for bucket in 1..starts.len() {
-        starts[bucket] += starts[bucket - 1];
-    }
-    let mut next = starts.clone();
-    let mut items = vec![0; starts[count] as usize];
-    for (item, bucket) in pairs {
-        items[next[bucket] as usize] = item;
-        next[bucket] += 1;
-    }
-    (starts, items)
 }
 
 /// What lies at a place, as the camera measured it.
@@ -200,8 +189,8 @@ const POINTS_PER_PIXEL: f64 = 3.0;
 const MAX_PIXELS: f64 = 4e6;
 
 impl RangeImage {
-    /// Of all the points that a camera at `eye` measured, with pixels at least `pixel` wide at their mean distance (data
-    /// units), and wider where the points are sparser than that. `None` if there is no point before the camera.
+    /// Of all the points that a camera at `eye` measured, with pixels at least `pixel` wide at their mean distance
+    /// (data units), and wider where the points are sparser than that. `None` if there is no point before the camera.
     ///
     /// # Complexity
     /// O(points + pixels), at most 4 million pixels.
@@ -213,15 +202,10 @@ impl RangeImage {
         let axes = [right, down, forward];
         let rays: Vec<([f64; 2], f64)> = points.iter().filter_map(|p| ray(&axes, p - eye)).collect();
         let mean = rays.iter().map(|(_, range)| range).sum::<f64>() / rays.len().max(1) as f64;
-        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        for (at, _) in &rays {
-            for k in 0..2 {
-                (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k]));
-            }
-        }
         if rays.is_empty() {
             return None;
         }
+        let (low, high) = corners(rays.iter().map(|(at, _)| at));
         let size = [0, 1].map(|k| high[k] - low[k]);
         let mut pixel = (pixel / mean).max((size[0] * size[1] / MAX_PIXELS).sqrt()).max(1e-6);
         loop {
@@ -282,8 +266,8 @@ impl RangeImage {
         Self { pixels, ..self }
     }
 
-    /// What was measured at `point`, of the target's frame, give or take `tolerance` in range. Edges are blurred by a pixel
-    /// on each side: a point is hidden, or seen through, if it is so for all pixels around it.
+    /// What was measured at `point`, of the target's frame, give or take `tolerance` in range. Edges are blurred by a
+    /// pixel on each side: a point is hidden, or seen through, if it is so for all pixels around it.
     #[must_use]
     pub fn sight(&self, point: &Point3<f64>, tolerance: f64) -> Sight {
         let Some((at, range)) = ray(&self.axes, point - self.eye) else { return Sight::Open };

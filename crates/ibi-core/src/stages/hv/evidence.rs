@@ -7,8 +7,8 @@ use crate::stages::{Context, Hypothesis, Validate, Verdict};
 /// `evidence`: accepts a pose if it is right with a probability of more than `t_score`.
 ///
 /// Judged by how unlikely it is that so many correspondences agree by chance, in this scene, and by how much closer
-/// the two clouds lie than chance would put them. The verdict is given in log odds. In a scene seen from one side only what the
-/// camera can see counts, and the margin is in proportion to how much of the source a pose explains.
+/// the two clouds lie than chance would put them. The verdict is given in log odds. In a scene seen from one side only
+/// what the camera can see counts, and the margin is in proportion to how much of the source a pose explains.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(
     feature = "serde",
@@ -39,8 +39,8 @@ impl Evidence {
     }
 }
 
-/// A glance rejects what falls short by more than this in log odds: four standard deviations of the fit of 64 points, and of
-/// about 100 that can be seen.
+/// A glance rejects what falls short by more than this in log odds: four standard deviations of the fit of 64 points,
+/// and of about 100 that can be seen.
 const GLANCE_MARGIN: f64 = 4.0;
 const GLANCE_MARGIN_ONE_SIDED: f64 = 2.0;
 
