@@ -52,7 +52,7 @@ def fail(kind):
 LONG = {
     "scs, many steps": ibi.Params(scs=ibi.Gtm(n_gtm=10_000_000)),
     "scs, many players": ibi.Params(scs=ibi.Gtm(n_downsample=16_384, n_gtm=10_000)),
-    "scs, dense graph": ibi.Params(scs=ibi.LocalGtm(tau_pr=3, max_degree=1_000_000)),
+    "scs, dense graph": ibi.Params(scs=ibi.LocalGtm(tau_pr=3, max_degree=1_000_000, first_look=None)),
     "te, many samples": ibi.Params(te=ibi.Ransac(n_ransac=10_000_000)),
     "te, many triangles": ibi.Params(
         ce=ibi.Voting(n_vot=1024), te=ibi.SacCot(n_sac_cot=1_000_000, t_cmp=0, max_triangles=1_000_000_000)

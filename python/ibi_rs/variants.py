@@ -56,6 +56,10 @@ class LocalGtm:
         Where correspondences have more compatible ones than this around them, only so many of them take part
         that they have about as many; at least 8. Bounds time and memory, and keeps those down that are
         compatible with all and sundry.
+    first_look
+        Where more correspondences than this lie around one, a first graph holds only so many of them, which
+        is enough to find most instances in a fraction of the time. Once nothing more comes of it, a graph of
+        all that are left takes its place. None: that one from the beginning. At least 8.
     n_gtm
         N_gtm: generations of the replicator; at least 1.
 
@@ -71,6 +75,7 @@ class LocalGtm:
     normal_tolerance: float = 0.5
     second_order: bool = True
     max_degree: int = 80
+    first_look: int | None = 256
     n_gtm: int = 20
 
 

@@ -262,8 +262,9 @@ fn kernels(c: &mut Criterion) {
             normal_tolerance: 0.5,
             second_order: true,
             max_degree: 80,
+            max_vicinity: u32::MAX,
         };
-        let graph = || Graph::new(black_box(&all), None, &test, || false);
+        let graph = || Graph::new(black_box(&all), None, &test, |_| true, || false);
         assert!(graph().len() > 1000);
         group.bench_function("graph/5000", |b| b.iter(graph));
         let by_target = ByTarget::new(&all);

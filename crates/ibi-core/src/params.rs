@@ -186,6 +186,7 @@ impl Params {
                 min_length_pr: 2.0,
                 normal_tolerance: 0.3,
                 max_degree: 256,
+                first_look: None,
                 ..LocalGtm::default()
             }
             .into(),
@@ -226,7 +227,7 @@ const LENGTHS: std::ops::RangeInclusive<f64> = 1e-9..=1e9;
 
 /// Reads an option, in which the word `none` stands for no value: TOML cannot say it otherwise.
 #[cfg(feature = "serde")]
-fn none_or<'de, D, T>(deserializer: D) -> Result<Option<T>, D::Error>
+pub(crate) fn none_or<'de, D, T>(deserializer: D) -> Result<Option<T>, D::Error>
 where
     D: serde::Deserializer<'de>,
     T: serde::Deserialize<'de>,

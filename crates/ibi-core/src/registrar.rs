@@ -23,6 +23,9 @@ const CONTEST_MARGIN: f64 = 0.8;
 /// A pose with an MAE of so much is looked at closely at once.
 const MANY_INLIERS: f64 = 10.0;
 
+/// After so many rounds in a row that came to nothing, a first look is over.
+const FIRST_REJECTIONS: u32 = 4;
+
 /// Poses that move no point farther apart than this are as good as each other.
 const NEGLIGIBLE_PR: f64 = 0.3;
 
@@ -259,6 +262,9 @@ impl<'a> Registrar<'a> {
         state.problem.interrupt.check()?;
         state.timings.add(&play.timings);
         if play.seeds.len() < self.params.t_s as usize {
+            if state.end_first_look(true) {
+                return self.round(state);
+            }
             let (value, threshold) = (play.seeds.len() as u32, self.params.t_s);
             return ControlFlow::Break(StopReason::FewSeeds { value, threshold });
         }
@@ -268,6 +274,7 @@ impl<'a> Registrar<'a> {
             state.turn_best(&self.params, self.hv());
             state.accept_best(&self.params, f64::NEG_INFINITY);
         }
+        state.end_first_look(state.num_rejections() >= FIRST_REJECTIONS);
         if state.rounds_since_settling >= self.params.n_contest {
             self.settle(state);
         }

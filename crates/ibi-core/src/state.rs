@@ -51,6 +51,7 @@ pub(crate) struct Problem<'a> {
     pub(crate) alive: Alive,
     pub(crate) barred: Vec<bool>,
     pub(crate) graph: OnceLock<Graph>,
+    pub(crate) is_first_look: bool,
     pub(crate) votes: OnceLock<Vec<Option<[f32; 3]>>>,
     pub(crate) chance: OnceLock<Chance>,
     pub(crate) interrupt: Interrupt,
@@ -128,6 +129,7 @@ impl<'a> Problem<'a> {
             alive,
             barred,
             graph: OnceLock::new(),
+            is_first_look: true,
             votes: OnceLock::new(),
             chance: OnceLock::new(),
             interrupt,
@@ -184,6 +186,7 @@ impl<'a> Problem<'a> {
             barred: &self.barred,
             claims: Claims::new(&self.scene, params, found),
             graph: &self.graph,
+            is_first_look: self.is_first_look,
             votes: &self.votes,
             chance: &self.chance,
             interrupt: &self.interrupt,
@@ -207,6 +210,22 @@ impl<'a> State<'a> {
             last_passed_at: 0,
             start,
         }
+    }
+
+    /// Ends the first look, if there is one and `is_over`; returns whether it did.
+    pub(crate) fn end_first_look(&mut self, is_over: bool) -> bool {
+        let Problem { graph, is_first_look, .. } = &mut self.problem;
+        let ends = is_over && *is_first_look && graph.get().is_some_and(Graph::is_sample);
+        if ends {
+            (*graph, *is_first_look, self.ahead) = (OnceLock::new(), false, None);
+            self.last_passed_at = self.rounds.len() as u32;
+        }
+        ends
+    }
+
+    /// Rounds since a hypothesis last passed validation, or an instance was last found.
+    pub(crate) fn num_rejections(&self) -> u32 {
+        self.rounds.len() as u32 - self.last_passed_at
     }
 
     /// The poses accepted so far, in the order they were found.
@@ -240,7 +259,7 @@ impl<'a> State<'a> {
         if let Some(threshold) = params.max_instances.filter(|&limit| found >= limit) {
             return ControlFlow::Break(StopReason::MaxInstances { value: found, threshold });
         }
-        let rejections = rounds - self.last_passed_at;
+        let rejections = self.num_rejections();
         if let Some(threshold) = params.max_rejections.filter(|&limit| rejections >= limit) {
             return ControlFlow::Break(StopReason::MaxRejections { value: rejections, threshold });
         }

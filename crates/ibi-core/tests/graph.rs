@@ -50,8 +50,9 @@ fn graph_with(
         normal_tolerance: test.normal_tolerance as f32,
         second_order,
         max_degree: u32::MAX,
+        max_vicinity: u32::MAX,
     };
-    Graph::new(&columns(pairs, unit), normals.as_ref(), &test, || false)
+    Graph::new(&columns(pairs, unit), normals.as_ref(), &test, |_| true, || false)
 }
 
 /// By how much the angles of i and j pass, and how exactly `f32` knows it: the shorter the line between two
@@ -305,8 +306,9 @@ fn an_interrupted_graph_is_empty_but_whole() {
         normal_tolerance: 0.3,
         second_order: true,
         max_degree: u32::MAX,
+        max_vicinity: u32::MAX,
     };
-    let graph = Graph::new(&columns(&scene_pairs(), 0.2), None, &test, || true);
+    let graph = Graph::new(&columns(&scene_pairs(), 0.2), None, &test, |_| true, || true);
     assert_eq!(graph.len(), 400);
     assert!((0..400).all(|i| graph.edges(i).0.is_empty() && support(&graph, i) == 0.0));
 }

@@ -35,11 +35,12 @@ fn edge_test(test: &naive::EdgeTest, max_degree: u32) -> EdgeTest {
         normal_tolerance: test.normal_tolerance as f32,
         second_order: true,
         max_degree,
+        max_vicinity: u32::MAX,
     }
 }
 
 fn graph_of(pairs: &[Pair], test: &naive::EdgeTest, max_degree: u32) -> Graph {
-    Graph::new(&columns(pairs), None, &edge_test(test, max_degree), || false)
+    Graph::new(&columns(pairs), None, &edge_test(test, max_degree), |_| true, || false)
 }
 
 /// For the models below, which are 2 wide: nothing of a copy is too far for an edge, and next to nothing too near.
@@ -304,7 +305,7 @@ fn degrees_heed_the_normals() {
     let normals: Vec<Vector3<f32>> = normals.iter().map(|n| n.cast()).collect();
     let ask = |target: Vec<Vector3<f32>>| {
         let normals = PairNormals { source: normals.clone(), target, oriented: true };
-        Graph::new(&columns(&pairs), Some(&normals), &edge_test(&TEST, MAX_DEGREE), || false)
+        Graph::new(&columns(&pairs), Some(&normals), &edge_test(&TEST, MAX_DEGREE), |_| true, || false)
     };
     assert_about(ask(turned).len(), MAX_DEGREE);
     assert_eq!(ask(wrong).len(), 600);
@@ -362,7 +363,7 @@ fn removal_from_a_thinned_graph_passes_over_what_is_no_node() {
 fn an_interrupted_thinned_graph_has_the_nodes_and_no_edges() {
     let pairs = clique(1000, [0.0; 3], &mut Rng::new(10));
     let whole = graph_of(&pairs, &TEST, MAX_DEGREE);
-    let graph = Graph::new(&columns(&pairs), None, &edge_test(&TEST, MAX_DEGREE), || true);
+    let graph = Graph::new(&columns(&pairs), None, &edge_test(&TEST, MAX_DEGREE), |_| true, || true);
     assert_eq!(nodes(&graph, 1000), nodes(&whole, 1000));
     assert_eq!(num_ends(&graph), 0);
 }
@@ -404,4 +405,49 @@ fn the_rhythm_of_a_list_does_not_matter() {
         assert_about((right..3000).step_by(2).filter(|&id| graph.node(id).is_some()).count(), MAX_DEGREE);
         assert!(num_ends(&graph) <= 2 * graph.len() * MAX_DEGREE as usize);
     }
+}
+
+fn nodes_ids(graph: &Graph) -> Vec<u32> {
+    (0..graph.len() as u32).map(|node| graph.id(node)).collect()
+}
+
+proptest! {
+    // Leaving out the dead is the same as never having had them.
+    #[test]
+    fn the_dead_are_no_nodes(pairs in correspondences(0..120), tau in 0.3..5.0, max_length in 2.0..40.0, every in 1..5_u32) {
+        let test = naive::EdgeTest { tau, min_length: 0.1, max_length, normal_tolerance: 0.3 };
+        let is_alive = |id: u32| !id.is_multiple_of(every);
+        let columns = columns(&pairs);
+        let graph = Graph::new(&columns, None, &edge_test(&test, u32::MAX), is_alive, || false);
+        let mut ids = nodes_ids(&graph);
+        ids.sort_unstable();
+        prop_assert_eq!(&ids, &(0..pairs.len() as u32).filter(|&id| is_alive(id)).collect::<Vec<_>>());
+        prop_assert!(!graph.is_sample());
+        check_graph(&graph, &pairs, &test);
+    }
+}
+
+#[test]
+fn a_sample_leaves_about_as_many_in_the_vicinity_and_is_the_graph_of_its_nodes() {
+    let mut rng = Rng::new(21);
+    // A crowd and a few by themselves, far apart.
+    let pairs = [clique(1500, [0.0; 3], &mut rng), clique(40, [50.0, 0.0, 0.0], &mut rng)].concat();
+    let sampled = |max_vicinity| {
+        let test = EdgeTest { max_vicinity, ..edge_test(&TEST, u32::MAX) };
+        Graph::new(&columns(&pairs), None, &test, |_| true, || false)
+    };
+    for max_vicinity in [64, 256, 1000] {
+        let graph = sampled(max_vicinity);
+        assert!(graph.is_sample());
+        check_graph(&graph, &pairs, &TEST);
+        let ids = nodes_ids(&graph);
+        assert_eq!(ids.iter().filter(|&&id| id >= 1500).count(), 40, "those by themselves are all kept");
+        // All of the crowd lie around each of it, but for those at its rim.
+        let num = ids.len() - 40;
+        let expected = max_vicinity as usize;
+        assert!((expected * 9 / 10..2 * expected).contains(&num), "{num} for {max_vicinity}");
+    }
+    let whole = sampled(1500);
+    assert!(!whole.is_sample());
+    assert_eq!(whole.len(), pairs.len());
 }

@@ -53,13 +53,16 @@ fn check_params(json: &str) -> PyResult<String> {
 #[pyfunction]
 fn params_to_toml(json: &str) -> PyResult<String> {
     let mut plain = serde_json::to_value(parse(json)?).map_err(invalid)?;
-    // TOML has no null, and what it leaves out takes its default, which need not be none.
-    for value in plain.as_object_mut().into_iter().flat_map(|params| params.values_mut()) {
-        if value.is_null() {
-            *value = "none".into();
-        }
-    }
+    nulls_to_none(&mut plain);
     toml::to_string(&plain).map_err(invalid)
+}
+
+/// TOML has no null, and what it leaves out takes its default, which need not be none.
+fn nulls_to_none(value: &mut serde_json::Value) {
+    if value.is_null() {
+        *value = "none".into();
+    }
+    value.as_object_mut().into_iter().flat_map(|inner| inner.values_mut()).for_each(nulls_to_none);
 }
 
 #[pyfunction]

@@ -87,6 +87,8 @@ pub struct Context<'a> {
     pub claims: Claims<'a>,
     /// The compatibility graph of all correspondences, built by the first stage that wants it.
     pub graph: &'a OnceLock<Graph>,
+    /// Whether a part of the correspondences will do for the graph: once nothing more comes of it, another is built.
+    pub is_first_look: bool,
     /// Where each correspondence puts the centroid of the source, in the frame of the columns, if anywhere; filled by the
     /// first stage that wants it.
     pub votes: &'a OnceLock<Vec<Option<[f32; 3]>>>,

@@ -8,13 +8,82 @@ use super::super::par;
 use super::super::simd::simd;
 use super::{EdgeTest, Edges, NONE, PairNormals};
 
-/// Finds the edges of each correspondence. Places are positions in the order of the grid.
+/// Correspondences in the order of a grid over their target points, and what lies around each cell. Places are
+/// positions in this order.
+pub(super) struct Places {
+    /// The correspondence at each place.
+    ids: Vec<u32>,
+    pairs: Columns,
+    /// For each cell that holds any: its places, and, ascending, those that may be joined to them.
+    cells: Vec<(Range<usize>, Vec<Range<usize>>)>,
+}
+
+impl Places {
+    /// All of `pairs`. `max_length` is that of an edge.
+    pub(super) fn new(pairs: &Columns, max_length: f32, cell: f32) -> Self {
+        let grid = Grid::new(&pairs.q, cell);
+        let cells = grid.neighborhoods(max_length).collect();
+        Self { pairs: pairs.gather(grid.order()), ids: grid.order().to_vec(), cells }
+    }
+
+    /// Number of places.
+    pub(super) fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Those of the correspondences that are alive.
+    pub(super) fn filtered(self, is_alive: impl Fn(u32) -> bool) -> Self {
+        let is_kept: Vec<bool> = self.ids.iter().map(|&id| is_alive(id)).collect();
+        self.kept(&is_kept)
+    }
+
+    /// So many of them, evenly spread, that about `max_vicinity` lie around each.
+    pub(super) fn sampled(self, max_vicinity: u32) -> Self {
+        let mut num_many = 0;
+        let mut is_kept = vec![true; self.len()];
+        for (home, runs) in &self.cells {
+            let num: usize = runs.iter().map(Range::len).sum();
+            if num > max_vicinity as usize {
+                let share = f64::from(max_vicinity) / num as f64;
+                for place in home.clone() {
+                    num_many += 1;
+                    is_kept[place] = out_of_step(num_many) < share;
+                }
+            }
+        }
+        self.kept(&is_kept)
+    }
+
+    /// Those of `is_kept`, moved together.
+    fn kept(self, is_kept: &[bool]) -> Self {
+        if !is_kept.contains(&false) {
+            return self;
+        }
+        // How many are kept before each place.
+        let mut before = Vec::with_capacity(is_kept.len() + 1);
+        before.push(0);
+        before.extend(is_kept.iter().scan(0, |num, &is_kept| {
+            *num += usize::from(is_kept);
+            Some(*num)
+        }));
+        let moved = |run: &Range<usize>| before[run.start]..before[run.end];
+        let cells = self.cells.iter().filter_map(|(home, runs)| {
+            let home = moved(home);
+            let runs = || runs.iter().map(moved).filter(|run| !run.is_empty()).collect();
+            (!home.is_empty()).then(|| (home, runs()))
+        });
+        let cells = cells.collect();
+        let kept: Vec<u32> = (0..self.ids.len() as u32).filter(|&place| is_kept[place as usize]).collect();
+        let ids = kept.iter().map(|&place| self.ids[place as usize]).collect();
+        Self { ids, pairs: self.pairs.gather(&kept), cells }
+    }
+}
+
+/// Finds the edges of each correspondence.
 pub(super) struct Finder<'a> {
-    /// In the order of the grid.
-    pub(super) pairs: Columns,
+    pub(super) places: Places,
     /// By correspondence.
     pub(super) normals: Option<&'a PairNormals>,
-    pub(super) grid: &'a Grid,
     pub(super) test: &'a EdgeTest,
 }
 
@@ -27,49 +96,51 @@ struct Rows {
 }
 
 impl Finder<'_> {
-    /// The nodes, and the edges weighed by w_ij = 1 - (r / tau)^2.
-    pub(super) fn find(&self, interrupted: &(impl Fn() -> bool + Sync)) -> (Vec<u32>, Edges) {
-        let cells: Vec<_> = self.grid.neighborhoods(self.test.max_length).collect();
-        let degrees = par::map(cells.len(), 4, |cell| self.estimated_degrees(&cells[cell]));
-        let is_node = thinned(&degrees.concat(), self.test.max_degree);
-        let thins = is_node.contains(&false);
-        let upper = par::map(cells.len(), 4, |cell| {
-            let (home, runs) = &cells[cell];
-            let nodes = home.clone().filter(|&place| is_node[place]);
+    /// The correspondences of the nodes, and the edges weighed by w_ij = 1 - (r / tau)^2.
+    pub(super) fn find(mut self, interrupted: &(impl Fn() -> bool + Sync)) -> (Vec<u32>, Edges) {
+        let degrees = self.map_cells(|home, runs| self.estimated_degrees(home, runs));
+        self.places = self.places.kept(&thinned(&degrees.concat(), self.test.max_degree));
+        let upper = self.map_cells(|home, runs| {
             let mut rows = Rows::default();
             if interrupted() {
-                rows.lens = vec![0; nodes.count()];
+                rows.lens = vec![0; home.len()];
             } else {
                 // Only what comes later in the order: the graph is symmetric.
                 let later = runs.iter().map(|run| run.start.max(home.start)..run.end.max(home.start));
-                let vicinity = if thins {
-                    Vicinity::new(&self.pairs, later.flatten().filter(|&place| is_node[place]))
-                } else {
-                    Vicinity::of_runs(&self.pairs, &later)
-                };
-                vicinity.push_rows(self, nodes, &mut rows);
+                Vicinity::of_runs(&self.places.pairs, &later).push_rows(&self, home, &mut rows);
             }
             rows
         });
-        self.assemble(&upper, &is_node)
+        (self.places.ids, assembled(&upper))
+    }
+
+    fn map_cells<T: Send>(&self, of: impl Fn(Range<usize>, &[Range<usize>]) -> T + Sync) -> Vec<T> {
+        let cells = &self.places.cells;
+        par::map(cells.len(), 4, |cell| of(cells[cell].0.clone(), &cells[cell].1))
     }
 
     /// About how many neighbours each correspondence of a cell has; 0 where the vicinity is too small for it to matter.
-    fn estimated_degrees(&self, (home, runs): &(Range<usize>, Vec<Range<usize>>)) -> Vec<f32> {
+    fn estimated_degrees(&self, home: Range<usize>, runs: &[Range<usize>]) -> Vec<f32> {
         /// So many of the vicinity are looked at: a degree is good to a fifth.
         const SAMPLE: usize = 128;
         let num: usize = runs.iter().map(Range::len).sum();
         if num <= 2_usize.saturating_mul(self.test.max_degree as usize) {
             return vec![0.0; home.len()];
         }
-        let step = num as f64 / SAMPLE as f64;
-        let mut chosen = (0..SAMPLE).map(|i| ((i as f64 + out_of_step(i)) * step) as usize).peekable();
-        let all = runs.iter().cloned().flatten().enumerate();
-        let some = all.filter(|&(at, _)| chosen.next_if_eq(&at).is_some()).map(|(_, place)| place);
-        let mut vicinity = Vicinity::new(&self.pairs, some);
+        let step = (num as f64 / SAMPLE as f64).max(1.0);
+        let mut chosen =
+            (0..SAMPLE.min(num)).map(|i| ((i as f64 + out_of_step(i)) * step) as usize).peekable();
+        let (mut some, mut start) = (Vec::with_capacity(SAMPLE), 0);
+        for run in runs {
+            while let Some(at) = chosen.next_if(|&at| at < start + run.len()) {
+                some.push((run.start + at - start) as u32);
+            }
+            start += run.len();
+        }
+        let mut vicinity = Vicinity::new(&self.places.pairs, some);
         let scale = step as f32;
-        let degrees = home.clone().map(|place| {
-            vicinity.join(self.pairs.pair(place), self.test, 0);
+        let degrees = home.map(|place| {
+            vicinity.join(self.places.pairs.pair(place), self.test, 0);
             let mut hits = 0_u32;
             vicinity.each_joined(0, |at| {
                 hits += u32::from(self.normals_fit(place, vicinity.places[at] as usize));
@@ -82,37 +153,26 @@ impl Finder<'_> {
     /// Whether the normals at two places allow an edge.
     fn normals_fit(&self, place: usize, other: usize) -> bool {
         self.normals.is_none_or(|normals| {
-            let [i, j] = [place, other].map(|place| self.grid.order()[place] as usize);
-            normals.compatible((i, j), (place, other), &self.pairs, self.test.normal_tolerance)
+            let Places { ids, pairs, .. } = &self.places;
+            let [i, j] = [place, other].map(|place| ids[place] as usize);
+            normals.compatible((i, j), (place, other), pairs, self.test.normal_tolerance)
         })
     }
+}
 
-    /// The nodes, and their rows one after the other, in which places become nodes.
-    fn assemble(&self, rows: &[Rows], is_node: &[bool]) -> (Vec<u32>, Edges) {
-        let ids = self.grid.order().iter().zip(is_node).filter(|&(_, &is_node)| is_node).map(|(&id, _)| id);
-        let ids: Vec<u32> = ids.collect();
-        let mut starts = vec![0];
-        for &len in rows.iter().flat_map(|rows| &rows.lens) {
-            starts.push(starts[starts.len() - 1] + len as usize);
-        }
-        let num = starts[starts.len() - 1];
-        let (mut neighbors, mut weights) = (Vec::with_capacity(num), Vec::with_capacity(num));
-        for rows in rows {
-            neighbors.extend_from_slice(&rows.neighbors);
-            weights.extend_from_slice(&rows.weights);
-        }
-        if ids.len() < is_node.len() {
-            let nodes = is_node.iter().scan(0, |next, &is_node| {
-                *next += u32::from(is_node);
-                Some(*next - u32::from(is_node))
-            });
-            let nodes: Vec<u32> = nodes.collect();
-            for place in &mut neighbors {
-                *place = nodes[*place as usize];
-            }
-        }
-        (ids, Edges { starts, neighbors, weights })
+/// Rows of all cells, one after the other.
+fn assembled(rows: &[Rows]) -> Edges {
+    let mut starts = vec![0];
+    for &len in rows.iter().flat_map(|rows| &rows.lens) {
+        starts.push(starts[starts.len() - 1] + len as usize);
     }
+    let num = starts[starts.len() - 1];
+    let (mut neighbors, mut weights) = (Vec::with_capacity(num), Vec::with_capacity(num));
+    for rows in rows {
+        neighbors.extend_from_slice(&rows.neighbors);
+        weights.extend_from_slice(&rows.weights);
+    }
+    Edges { starts, neighbors, weights }
 }
 
 /// What can be joined to the correspondences of one cell, copied together and filled up to whole vectors: the runs of
@@ -129,8 +189,7 @@ struct Vicinity {
 const LANES: usize = 64;
 
 impl Vicinity {
-    fn new(pairs: &Columns, places: impl Iterator<Item = usize>) -> Self {
-        let places = places.map(|place| place as u32).collect();
+    fn new(pairs: &Columns, places: Vec<u32>) -> Self {
         Self::filled(pairs, places, |places, axis, column| {
             column.extend(places.iter().map(|&place| axis[place as usize]));
         })
@@ -183,11 +242,11 @@ impl Vicinity {
         }
     }
 
-    /// Adds the rows of `nodes`: the neighbours that come later in the order.
-    fn push_rows(mut self, finder: &Finder<'_>, nodes: impl Iterator<Item = usize>, rows: &mut Rows) {
+    /// Adds the rows of the places `home`: the neighbours that come later in the order.
+    fn push_rows(mut self, finder: &Finder<'_>, home: Range<usize>, rows: &mut Rows) {
         let inv_tau_sq = 1.0 / (finder.test.tau * finder.test.tau);
-        for place in nodes {
-            let (p, q) = finder.pairs.pair(place);
+        for place in home {
+            let (p, q) = finder.places.pairs.pair(place);
             let before = rows.neighbors.len();
             let first = self.places.partition_point(|&other| other as usize <= place) / LANES * LANES;
             self.join((p, q), finder.test, first);

@@ -15,9 +15,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use nalgebra::{Isometry3, Vector3};
 
 use super::columns::Columns;
-use super::grid::Grid;
 use super::par;
-use find::Finder;
+use find::{Finder, Places};
 
 /// When two correspondences count as compatible. Lengths in the unit of the columns.
 #[derive(Debug, Clone, Copy)]
@@ -35,6 +34,8 @@ pub struct EdgeTest {
     /// Where correspondences have more neighbours than this, only so many of them become nodes that they have about as
     /// many. Bounds the time (a scene without outliers would be one clique) and the memory.
     pub max_degree: u32,
+    /// Where more correspondences than this lie around one, about so many of them become nodes: enough for a first look.
+    pub max_vicinity: u32,
 }
 
 /// Unit normals at the two points of each correspondence.
@@ -64,6 +65,8 @@ pub struct Graph {
     /// One more than the seeds that the neighbourhood of a node came to, if they were too few; else 0. Set through a
     /// shared reference, by one thread at a time: the stage that plays the neighbourhoods.
     futile: Vec<AtomicU32>,
+    /// Whether some correspondences were left out because of `max_vicinity`.
+    is_sample: bool,
 }
 
 /// No node.
@@ -73,7 +76,7 @@ const NONE: u32 = u32::MAX;
 const CELLS_PER_LENGTH: f32 = 2.0;
 
 impl Graph {
-    /// Builds the graph of `pairs`.
+    /// Builds the graph of those of `pairs` that are alive.
     ///
     /// # Complexity
     /// Time: the pairs of target points within `max_length`, plus, for each edge, the neighbours of one end.
@@ -83,11 +86,15 @@ impl Graph {
         pairs: &Columns,
         normals: Option<&PairNormals>,
         test: &EdgeTest,
+        is_alive: impl Fn(u32) -> bool,
         interrupted: impl Fn() -> bool + Sync,
     ) -> Self {
-        let grid = Grid::new(&pairs.q, test.max_length / CELLS_PER_LENGTH);
-        let finder = Finder { pairs: pairs.gather(grid.order()), normals, grid: &grid, test };
-        let (ids, mut edges) = finder.find(&interrupted);
+        let places = Places::new(pairs, test.max_length, test.max_length / CELLS_PER_LENGTH);
+        let places = places.filtered(is_alive);
+        let num_alive = places.len();
+        let places = places.sampled(test.max_vicinity);
+        let is_sample = places.len() < num_alive;
+        let (ids, mut edges) = Finder { places, normals, test }.find(&interrupted);
         if test.second_order {
             edges.weigh_by_common_neighbors(&interrupted);
         }
@@ -97,6 +104,7 @@ impl Graph {
             graph.nodes[id as usize] = node;
         }
         graph.ids = ids;
+        graph.is_sample = is_sample;
         graph.alive = vec![true; graph.len()];
         graph.futile = (0..graph.len()).map(|_| AtomicU32::new(0)).collect();
         graph.support = par::map(graph.len(), 1024, |node| graph.supported(node as u32));
@@ -153,7 +161,14 @@ impl Graph {
 
     fn supported(&self, node: u32) -> f32 {
         let (neighbors, weights) = self.edges(node);
-        neighbors.iter().zip(weights).map(|(&j, &w)| if self.is_alive(j) { w } else { 0.0 }).sum()
+        // Not `sum`: that of nothing is -0, whose bits are more than those of any support.
+        neighbors.iter().zip(weights).fold(0.0, |sum, (&j, &w)| if self.is_alive(j) { sum + w } else { sum })
+    }
+
+    /// Whether correspondences were left out because too many others lie around them.
+    #[must_use]
+    pub fn is_sample(&self) -> bool {
+        self.is_sample
     }
 
     /// Number of nodes.

@@ -15,6 +15,12 @@ const FEW_SHARE: f32 = 0.3;
 /// With the leader play at most so many of its neighbours, those with the largest weights.
 const MAX_OTHERS: usize = 63;
 
+/// The `max_degree` of a first graph, if that is less.
+const FIRST_DEGREE: u32 = 16;
+
+/// Neighbourhoods in a row that come to too few seeds, and no more is expected of a first graph.
+const FIRST_FUTILE: u32 = 8;
+
 /// `local_gtm`: the game of `gtm`, played by the neighbourhood of one correspondence at a time in the
 /// second-order compatibility graph of *all* correspondences.
 ///
@@ -40,6 +46,11 @@ pub struct LocalGtm {
     /// have about as many. Bounds time and memory, and keeps those down that are compatible with all and sundry. At
     /// least 8.
     pub max_degree: u32,
+    /// Where more correspondences than this lie around one, a first graph holds only so many of them, which is enough to
+    /// find most instances in a fraction of the time. Once nothing more comes of it, a graph of all that are left takes
+    /// its place. `None`: that one from the beginning. At least 8.
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "crate::params::none_or"))]
+    pub first_look: Option<u32>,
     /// `N_gtm`: generations of the replicator. At least 1.
     pub n_gtm: u32,
 }
@@ -52,6 +63,7 @@ impl Default for LocalGtm {
             normal_tolerance: 0.5,
             second_order: true,
             max_degree: 80,
+            first_look: Some(256),
             n_gtm: 20,
         }
     }
@@ -63,29 +75,30 @@ impl LocalGtm {
         non_negative("scs.min_length_pr", self.min_length_pr)?;
         positive("scs.normal_tolerance", self.normal_tolerance)?;
         at_least_8("scs.max_degree", self.max_degree)?;
+        if let Some(first_look) = self.first_look {
+            at_least_8("scs.first_look", first_look)?;
+        }
         at_least_1("scs.n_gtm", self.n_gtm)
     }
 
     fn build(&self, context: &Context<'_>) -> Graph {
         let diameter_pr = context.scene.source.diameter() / context.scene.resolution;
+        let (max_degree, max_vicinity) = match self.first_look.filter(|_| context.is_first_look) {
+            Some(max_vicinity) => (self.max_degree.min(FIRST_DEGREE), max_vicinity),
+            None => (self.max_degree, u32::MAX),
+        };
         let test = EdgeTest {
             tau: self.tau_pr as f32,
             min_length: self.min_length_pr as f32,
             max_length: (diameter_pr + self.tau_pr) as f32,
             normal_tolerance: self.normal_tolerance as f32,
             second_order: self.second_order,
-            max_degree: self.max_degree,
+            max_degree,
+            max_vicinity,
         };
         let interrupted = || context.interrupt.is_set();
-        let mut graph =
-            Graph::new(&context.pairs.columns, context.pairs.normals.as_ref(), &test, interrupted);
-        // In the first round everything is alive; a stage of the user's may have begun the run, though.
-        let num_pairs = context.pairs.len();
-        if context.alive.ids().len() < num_pairs {
-            let is_dead = |id: &u32| context.alive.ids().binary_search(id).is_err();
-            graph.remove(&(0..num_pairs as u32).filter(is_dead).collect::<Vec<_>>());
-        }
-        graph
+        let is_alive = |id| context.alive.contains(id);
+        Graph::new(&context.pairs.columns, context.pairs.normals.as_ref(), &test, is_alive, interrupted)
     }
 
     /// The seeds among `leader` and its alive neighbours.
@@ -143,6 +156,7 @@ impl SelectSeeds for LocalGtm {
         let is_free = |node: u32| graph.is_alive(node) && !context.barred[graph.id(node) as usize];
         let enough = context.params.t_s as usize;
         let mut leaders = Leaders::new(graph, |node| is_free(node) && graph.futile(node).is_none());
+        let mut num_futile = 0;
         for leader in &mut leaders {
             let seeds = self.play(context, graph, leader);
             if seeds.len() >= enough || context.interrupt.is_set() {
@@ -151,6 +165,10 @@ impl SelectSeeds for LocalGtm {
             // It gives way to the next, and would lose again as long as its neighbourhood stays the same. Without
             // this memory a scan's run played a hundred games a round (measured: 44,000 in 478 rounds).
             graph.set_futile(leader, seeds.len() as u32);
+            num_futile += 1;
+            if graph.is_sample() && num_futile == FIRST_FUTILE {
+                return seeds;
+            }
         }
         // None has enough: the one that comes nearest says by how much.
         let all = (0..graph.len() as u32).filter(|&node| is_free(node));
