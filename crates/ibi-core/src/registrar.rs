@@ -14,8 +14,8 @@ use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
 use crate::scene::{Cloud, Detail, PreparedCloud, Scene, check_points};
-use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict};
-use crate::state::{Play, Problem, State, Tried};
+use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Polished, Ranked, SelectSeeds, Validate};
+use crate::state::{Judged, Play, Problem, State, Tried};
 
 /// A contest accepts nothing below this share of its best value.
 const CONTEST_MARGIN: f64 = 0.8;
@@ -29,8 +29,10 @@ const FIRST_REJECTIONS: u32 = 4;
 /// Poses that move no point farther apart than this are as good as each other.
 const NEGLIGIBLE_PR: f64 = 0.3;
 
-/// A pose at a first glance that is so near to one that has been judged will end up there.
-const SAME_PR: f64 = 2.0;
+/// A pose at a first glance that is so near to one that has been judged will end up there. In a scan, in which thousands of
+/// rounds look at the same few faces, a wider circle pays.
+const SAME_PR: f64 = 0.5;
+const SAME_PR_ONE_SIDED: f64 = 2.0;
 
 /// A prepared source, the parameters and the four stages; registers the source to any number of targets.
 ///
@@ -255,10 +257,16 @@ impl<'a> Registrar<'a> {
 
     fn round(&self, state: &mut State<'_>) -> ControlFlow<StopReason, Round> {
         state.check_limits(&self.params)?;
-        let play = match state.ahead.take() {
+        let mut play = match state.ahead.take() {
             Some(play) => play,
             None => self.play(state),
         };
+        // Of two rounds played at the same time the later did not know of the earlier.
+        if let (Some(raw), Some(judged)) = (&play.estimate.hypothesis, &play.judged)
+            && let Some(known) = self.known(&state.problem.scene, &state.tried, raw, judged.rough.as_ref())
+        {
+            play.judged = Some(known);
+        }
         state.problem.interrupt.check()?;
         state.timings.add(&play.timings);
         if play.seeds.len() < self.params.t_s as usize {
@@ -324,56 +332,63 @@ impl<'a> Registrar<'a> {
         let dense = timed(&mut timings.ce_s, || self.ce().enhance(context, &seeds));
         let estimate = timed(&mut timings.te_s, || self.te().estimate_pose(context, &dense));
         let judged = estimate.hypothesis.map(|raw| {
-            // Many seeds lead to one and the same pose: it is judged once. (A stage of the user's may think otherwise.)
-            let before = tried.get(&raw.target_from_source).filter(|_| self.hv.is_none());
+            let before = self.known(context.scene, tried, &raw, None);
             before.unwrap_or_else(|| self.judge(context, tried, raw, &mut timings))
         });
         Play { seeds, dense, estimate, judged, timings }
     }
 
-    /// Polishes a hypothesis and validates it. If it has few inliers, or the scene is seen from one side, it gets a
-    /// glance first: neither is done to the end where that shows it to be hopeless, or to be known.
-    fn judge(
+    /// What became of a hypothesis that was tried before, or of one that ended up where it is at a first glance, `rough`:
+    /// many seeds lead to one and the same pose.
+    fn known(
         &self,
-        context: &Context<'_>,
+        scene: &Scene<'_>,
         tried: &Tried,
-        raw: Hypothesis,
-        timings: &mut Timings,
-    ) -> (Hypothesis, Verdict) {
+        raw: &Hypothesis,
+        rough: Option<&Isometry3<f64>>,
+    ) -> Option<Judged> {
+        if !self.hv().is_repeatable() {
+            return None;
+        }
+        let same_pr = if scene.is_one_sided(&self.params) { SAME_PR_ONE_SIDED } else { SAME_PR };
+        let is_same = |a: &Isometry3<f64>, b: &Isometry3<f64>| {
+            scene.source.displacement(a, b) < same_pr * scene.resolution
+        };
+        let same = tried.get(&raw.target_from_source);
+        same.or_else(|| rough.and_then(|rough| tried.next_to(rough, is_same)))
+    }
+
+    /// Polishes a hypothesis and validates it. Before that comes a glance, at one that is polished roughly where it has few
+    /// inliers or the scene is seen from one side: neither is done to the end where it shows the hypothesis to be
+    /// hopeless, or to be known.
+    fn judge(&self, context: &Context<'_>, tried: &Tried, raw: Hypothesis, timings: &mut Timings) -> Judged {
         let Timings { refine_s, hv_s, .. } = timings;
         let scene = context.scene;
-        let shift = |a: &Hypothesis, b: &Hypothesis| {
-            scene.source.displacement(&a.target_from_source, &b.target_from_source) / scene.resolution
-        };
         let is_one_sided = scene.is_one_sided(context.params);
         let is_poor = raw.score < MANY_INLIERS || is_one_sided;
-        let mut rough = raw;
-        let polished = if is_poor { timed(refine_s, || context.refined(Detail::Glance, raw)) } else { None };
-        if let Some(polished) = polished {
-            rough = polished;
-            // In scans most rounds come upon a pose that is known.
-            let is_same = |a: &Isometry3<f64>, b: &Isometry3<f64>| {
-                scene.source.displacement(a, b) < SAME_PR * scene.resolution
-            };
-            if is_one_sided && let Some(judged) = tried.next_to(&rough.target_from_source, is_same) {
-                return judged;
-            }
+        let polished = if is_poor { timed(refine_s, || context.polished(Detail::Glance, raw)) } else { None };
+        let supported = polished.and_then(Polished::if_supported);
+        let glanced = supported.unwrap_or(raw);
+        // In a scan clouds fit almost anywhere: what has lost its correspondences there might as well be elsewhere.
+        let rough = (supported.is_some() || !is_one_sided).then_some(glanced.target_from_source);
+        if let Some(known) = self.known(scene, tried, &raw, rough.as_ref()) {
+            return known;
         }
-        if (polished.is_some() || is_one_sided)
-            && let Some(verdict) = timed(hv_s, || self.hv().glance(context, &rough))
-        {
-            return (rough, verdict);
+        let fitted = polished.filter(|_| !is_one_sided).map_or(glanced, |polished| polished.hypothesis);
+        if let Some(verdict) = timed(hv_s, || self.hv().glance(context, &fitted)) {
+            return Judged { hypothesis: glanced, verdict, rough };
         }
-        let hypothesis = timed(refine_s, || context.refined(Detail::Look, rough)).unwrap_or(raw);
+        let hypothesis = timed(refine_s, || context.refined(Detail::Look, glanced)).unwrap_or(raw);
         let verdict = timed(hv_s, || self.hv().validate(context, &hypothesis));
         // The clouds of a cluttered scene may draw a good pose away.
-        if verdict.accepted() && shift(&raw, &hypothesis) > NEGLIGIBLE_PR {
+        let shift = scene.source.displacement(&raw.target_from_source, &hypothesis.target_from_source);
+        if verdict.accepted() && shift > NEGLIGIBLE_PR * scene.resolution {
             let before = timed(hv_s, || self.hv().validate(context, &raw));
             if before.value > verdict.value {
-                return (raw, before);
+                return Judged { hypothesis: raw, verdict: before, rough };
             }
         }
-        (hypothesis, verdict)
+        Judged { hypothesis, verdict, rough }
     }
 
     /// Ends a contest: of the hypotheses that passed validation, the one with the best value becomes an

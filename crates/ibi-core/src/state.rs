@@ -73,34 +73,44 @@ pub(crate) struct Play {
     pub(crate) seeds: Ranked,
     pub(crate) dense: Ranked,
     pub(crate) estimate: Estimate,
-    /// The hypothesis as it was judged, polished or not.
-    pub(crate) judged: Option<(Hypothesis, Verdict)>,
+    pub(crate) judged: Option<Judged>,
     pub(crate) timings: Timings,
+}
+
+/// What became of an estimated pose.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Judged {
+    /// As it was judged, polished or not.
+    pub(crate) hypothesis: Hypothesis,
+    pub(crate) verdict: Verdict,
+    /// The pose at a first glance, unless that was worth nothing.
+    pub(crate) rough: Option<Isometry3<f64>>,
 }
 
 /// The estimated poses since an instance was last found, and what became of each.
 #[derive(Debug, Default)]
-pub(crate) struct Tried(Vec<(Isometry3<f64>, (Hypothesis, Verdict))>);
+pub(crate) struct Tried(Vec<(Isometry3<f64>, Judged)>);
 
 impl Tried {
     /// What became of `pose`, if it has been tried.
-    pub(crate) fn get(&self, pose: &Isometry3<f64>) -> Option<(Hypothesis, Verdict)> {
+    pub(crate) fn get(&self, pose: &Isometry3<f64>) -> Option<Judged> {
         self.0.iter().find(|(tried, _)| tried == pose).map(|&(_, judged)| judged)
     }
 
-    /// What became of a pose that ended up where `pose` is, as `is_same` has it.
+    /// What became of the first that ended up where the pose `rough` is at a first glance, as `is_same` has it.
     pub(crate) fn next_to(
         &self,
-        pose: &Isometry3<f64>,
+        rough: &Isometry3<f64>,
         is_same: impl Fn(&Isometry3<f64>, &Isometry3<f64>) -> bool,
-    ) -> Option<(Hypothesis, Verdict)> {
+    ) -> Option<Judged> {
         self.0
             .iter()
             .map(|&(_, judged)| judged)
-            .find(|(hypothesis, _)| is_same(pose, &hypothesis.target_from_source))
+            .find(|judged| is_same(rough, &judged.hypothesis.target_from_source))
+            .map(|judged| Judged { rough: Some(*rough), ..judged })
     }
 
-    fn add(&mut self, pose: &Isometry3<f64>, judged: (Hypothesis, Verdict)) {
+    fn add(&mut self, pose: &Isometry3<f64>, judged: Judged) {
         if self.get(pose).is_none() {
             self.0.push((*pose, judged));
         }
@@ -217,7 +227,8 @@ impl<'a> State<'a> {
         let Problem { graph, is_first_look, .. } = &mut self.problem;
         let ends = is_over && *is_first_look && graph.get().is_some_and(Graph::is_sample);
         if ends {
-            (*graph, *is_first_look, self.ahead) = (OnceLock::new(), false, None);
+            (*graph, *is_first_look) = (OnceLock::new(), false);
+            self.ahead = None;
             self.last_passed_at = self.rounds.len() as u32;
         }
         ends
@@ -277,7 +288,7 @@ impl<'a> State<'a> {
         if let (Some(raw), Some(judged)) = (estimate.hypothesis, judged) {
             self.tried.add(&raw.target_from_source, judged);
         }
-        let (hypothesis, verdict) = judged.unzip();
+        let (hypothesis, verdict) = judged.map(|judged| (judged.hypothesis, judged.verdict)).unzip();
         let index = self.rounds.len() as u32;
         let num_alive = self.problem.alive.len() as u32;
         let passed = hypothesis.filter(|_| verdict.is_some_and(|verdict: Verdict| verdict.accepted()));
@@ -412,7 +423,8 @@ impl<'a> State<'a> {
                 last.num_removed += num_removed;
             }
         }
-        (self.tried, self.ahead) = (Tried::default(), None);
+        self.tried = Tried::default();
+        self.ahead = None;
         self.found.push(Found { hypothesis, round });
         self.last_passed_at = self.rounds.len() as u32;
         Some(value)

@@ -89,6 +89,10 @@ impl Validate for Checked<Hv> {
         verdict
     }
 
+    fn is_repeatable(&self) -> bool {
+        self.0.is_repeatable()
+    }
+
     fn is_sure(&self, verdict: &Verdict) -> bool {
         assert!(verdict.accepted());
         self.0.is_sure(verdict)

@@ -367,3 +367,26 @@ fn mean_spacing_of_large_clouds_is_good_to_3_percent() {
         assert_eq!(spacing.to_bits(), mean_spacing(&cloud).to_bits(), "always the same sample");
     }
 }
+
+#[test]
+fn points_on_the_borders_and_in_the_middles_of_cells_are_found() {
+    // A cell is a little wider than the reach. Of many widths some put points on a border or in a middle to the last bit.
+    // A vector holds the points of the next cell too, unless there are enough in this one.
+    const COPIES: u32 = 20;
+    for step in 0..2000 {
+        let half = 0.5 * (1.005 + 1e-9 * f64::from(step - 1000));
+        for axis in 0..3 {
+            let point = |k: u32| {
+                let mut point = Point3::origin();
+                point[axis] = half * f64::from(k);
+                point
+            };
+            let cloud: Vec<_> = (0..12 * COPIES).map(|i| point(i / COPIES)).collect();
+            let nearby = Nearby::new(&cloud, 1.0);
+            for k in 0..12 {
+                let near = nearby.nearest_within(&point(k), 0.5);
+                assert_eq!(near.map(|row| row / COPIES), Some(k), "{half} {axis}");
+            }
+        }
+    }
+}

@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use super::simd::simd;
+
 /// Points sorted by cell, so that the points of a column of cells stand together.
 #[derive(Debug)]
 pub struct Grid {
@@ -10,6 +12,8 @@ pub struct Grid {
     inv_cell: [f32; 3],
     /// Cells per axis.
     shape: [usize; 3],
+    /// The last cell of each axis.
+    last: [f32; 3],
     /// Start of each cell in `order`, plus the end.
     starts: Vec<u32>,
     order: Vec<u32>,
@@ -19,6 +23,9 @@ pub struct Grid {
 /// a column stand together anyhow and a few more cost nothing, then on all axes.
 const MIN_CELLS: usize = 1 << 12;
 const CELLS_PER_POINT: usize = 4;
+
+/// Cells per axis at most: `f32` tells no more apart, and [`nearest_whole`] takes no more.
+const MAX_PER_AXIS: usize = 1 << 22;
 
 /// The part of a sorted sample that is cut off at either end before the box is taken, and how much of its width is
 /// then added on each side.
@@ -40,7 +47,7 @@ impl Grid {
         let bounds = points.each_ref().map(|axis| bulk(axis));
         let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
         let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
-        let mut cell = cell.max(widest / max_cells as f32).max(f32::MIN_POSITIVE);
+        let mut cell = cell.max(widest / max_cells.min(MAX_PER_AXIS) as f32).max(f32::MIN_POSITIVE);
         let num = |axis: usize, cell: f32| ((bounds[axis].1 - bounds[axis].0) / cell) as usize + 1;
         while num(0, cell).checked_mul(num(1, cell)).is_none_or(|columns| columns > max_cells) {
             cell *= 1.1;
@@ -53,11 +60,22 @@ impl Grid {
             low: bounds.map(|(low, _)| low),
             inv_cell: [cell, cell, cell_z].map(|cell| 1.0 / cell),
             shape: [shape[0], shape[1], num(2, cell_z).min(height)],
+            last: [0.0; 3],
             starts: Vec::new(),
             order: Vec::new(),
         };
-        let cells: Vec<u32> =
-            (0..n).map(|i| grid.index(grid.cell(points.each_ref().map(|axis| axis[i]))) as u32).collect();
+        grid.last = grid.shape.map(|num| (num - 1) as f32);
+        let [x, y, z] = points.each_ref().map(|axis| &axis[..n]);
+        let mut cells = vec![0_u32; n];
+        let (cells_mut, of) = (&mut cells[..], &grid);
+        simd(
+            #[inline(always)]
+            move || {
+                for (i, cell) in cells_mut.iter_mut().enumerate() {
+                    *cell = of.index(of.cell([x[i], y[i], z[i]])) as u32;
+                }
+            },
+        );
         let pairs = (0_u32..).zip(cells.iter().map(|&cell| cell as usize));
         (grid.starts, grid.order) = buckets(grid.shape.iter().product(), pairs);
         grid
@@ -166,10 +184,10 @@ impl Grid {
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn block(&self, place: [f32; 3]) -> [Range<usize>; 4] {
         let [x, y, z] = [0, 1, 2].map(|axis| {
-            let at = (place[axis] - self.low[axis]) * self.inv_cell[axis] - 0.5;
-            let last = self.shape[axis] - 1;
-            // A cast of a negative number gives 0; below half a cell there is none before the first.
-            [(at as usize).min(last), ((at + 1.0) as usize).min(last)]
+            let at = (place[axis] - self.low[axis]) * self.inv_cell[axis];
+            // Half-way cases go to the even number: the second is not what is nearest to `at`, which may be two more.
+            let first = nearest_whole(at - 1.0, self.last[axis]);
+            [first, (first + 1).min(self.shape[axis] - 1)]
         });
         let run = |x: usize, y: usize| {
             let row = self.index([x, y, 0]);
@@ -214,20 +232,34 @@ impl Grid {
         (below.max(above) - 1e-3).max(0.0) / self.inv_cell[axis]
     }
 
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // the body of a loop that must vectorise
     fn cell(&self, p: [f32; 3]) -> [usize; 3] {
-        [0, 1, 2].map(|axis| self.along(axis, p[axis]))
+        [self.along(0, p[0]), self.along(1, p[1]), self.along(2, p[2])]
     }
 
-    #[inline]
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // as above
     fn along(&self, axis: usize, x: f32) -> usize {
-        // A cast of a negative number gives 0.
-        (((x - self.low[axis]) * self.inv_cell[axis]) as usize).min(self.shape[axis] - 1)
+        nearest_whole((x - self.low[axis]) * self.inv_cell[axis] - 0.5, self.last[axis])
     }
 
-    #[inline]
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // as above
     fn index(&self, [x, y, z]: [usize; 3]) -> usize {
         (x * self.shape[1] + y) * self.shape[2] + z
     }
+}
+
+/// The whole number nearest to `x` among those from 0 to `last`, below 2^23. A cast, which has to mind every float there
+/// is, takes five times as long; here the sum has no room for a fraction, and ends in the bits of the whole number.
+#[inline(always)]
+#[allow(clippy::inline_always)] // as above
+fn nearest_whole(x: f32, last: f32) -> usize {
+    const WHOLE: f32 = (1 << 23) as f32;
+    let x = if x > 0.0 { x } else { 0.0 };
+    let x = if x < last { x } else { last };
+    ((x + WHOLE).to_bits() & 0x007f_ffff) as usize
 }
 
 /// The interval that holds the bulk of the values.
@@ -238,9 +270,10 @@ pub(crate) fn bulk(values: &[f32]) -> (f32, f32) {
         return (0.0, 0.0);
     }
     let mut sample: Vec<f32> = values.iter().copied().step_by(values.len().div_ceil(SAMPLE)).collect();
-    sample.sort_unstable_by(f32::total_cmp);
     let cut = sample.len() / TAIL;
-    let (low, high) = (sample[cut], sample[sample.len() - 1 - cut]);
+    let last = sample.len() - 1 - cut;
+    let (below, &mut high, _) = sample.select_nth_unstable_by(last, f32::total_cmp);
+    let low = if cut < last { *below.select_nth_unstable_by(cut, f32::total_cmp).1 } else { high };
     let margin = MARGIN * (high - low);
     ((low - margin).max(least), (high + margin).min(most))
 }

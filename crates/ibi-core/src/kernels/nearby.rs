@@ -42,7 +42,8 @@ impl Nearby {
         let middle = middle(points);
         let rows = columns(points, middle, reach);
         // The reach is 1: a cell and its neighbours hold it.
-        Self { sorted: Sorted::new(&rows, 1.001), middle, reach, inv_reach: 1.0 / reach }
+        // The reach is 1. A cell and its neighbours hold it, and the blocks of two cells an axis half of it for sure.
+        Self { sorted: Sorted::new(&rows, 1.005), middle, reach, inv_reach: 1.0 / reach }
     }
 
     /// The reach, in the unit of the points.

@@ -8,7 +8,7 @@ use super::simd::simd;
 /// payoffs of at least 1e-14 no product does.
 const EXTINCT: f32 = 1e-20;
 
-/// What n players gain from each other: a square matrix in rows of whole vectors.
+/// What n players gain from each other: a symmetric matrix in rows of whole vectors.
 #[derive(Debug, Clone)]
 pub struct Payoffs {
     n: usize,
@@ -83,22 +83,14 @@ impl Payoffs {
 /// # Complexity
 /// O(steps n^2).
 pub fn replicator(payoffs: &Payoffs, steps: usize, interrupted: impl Fn() -> bool) -> Option<Vec<f32>> {
-    let Payoffs { n, stride, ref values } = *payoffs;
+    let Payoffs { n, stride, .. } = *payoffs;
     let mut x = vec![1.0 / n as f32; n];
     x.resize(stride, 0.0);
     for _ in 0..steps {
         if interrupted() {
             break;
         }
-        let fitness = par::chunks(n, GRAIN, |rows| {
-            let rows = &values[rows.start * stride..rows.end * stride];
-            let x = &x[..];
-            simd(
-                #[inline(always)]
-                move || rows.chunks_exact(stride).map(|row| dot(row, x)).collect::<Vec<f32>>(),
-            )
-        });
-        let fitness = fitness.concat();
+        let fitness = if n <= FEW { fitness_of_few(payoffs, &x) } else { fitness(payoffs, &x) };
         let mean: f64 = x.iter().zip(&fitness).map(|(&x, &f)| f64::from(x) * f64::from(f)).sum();
         if mean <= 0.0 {
             return None;
@@ -112,5 +104,45 @@ pub fn replicator(payoffs: &Payoffs, steps: usize, interrupted: impl Fn() -> boo
     Some(x)
 }
 
-/// Rows that one thread takes at a time.
-const GRAIN: usize = 256;
+/// Pi x, row by row: large matrices come from memory, in its order.
+fn fitness(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
+    /// Rows that one thread takes at a time.
+    const GRAIN: usize = 256;
+    let (n, stride) = (*n, *stride);
+    let chunks = par::chunks(n, GRAIN, |rows| {
+        let rows = &values[rows.start * stride..rows.end * stride];
+        simd(
+            #[inline(always)]
+            move || rows.chunks_exact(stride).map(|row| dot(row, x)).collect::<Vec<f32>>(),
+        )
+    });
+    chunks.concat()
+}
+
+/// Players of whom a matrix stays in the cache.
+const FEW: usize = 128;
+
+/// The same as x^T Pi, which is the same as Pi is symmetric: a sum over rows needs no sum over lanes, and the extinct are
+/// passed over.
+fn fitness_of_few(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
+    let (n, stride) = (*n, *stride);
+    let mut fitness = vec![0.0; stride];
+    let blocks = fitness.as_chunks_mut::<LANES>().0;
+    simd(
+        #[inline(always)]
+        move || {
+            for (block, sums) in blocks.iter_mut().enumerate() {
+                let mut lanes = [0.0; LANES];
+                for (row, &x) in values[block * LANES..].chunks(stride).zip(&x[..n]) {
+                    if x > 0.0 {
+                        for (lane, payoff) in lanes.iter_mut().zip(&row[..LANES]) {
+                            *lane += x * payoff;
+                        }
+                    }
+                }
+                *sums = lanes;
+            }
+        },
+    );
+    fitness
+}

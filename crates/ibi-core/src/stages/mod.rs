@@ -59,6 +59,12 @@ pub trait Validate: Send + Sync {
         None
     }
 
+    /// Whether the verdict depends on nothing but the pose, what is alive and what is claimed. Then a hypothesis that ends
+    /// up where another one was judged is not judged again. By default it may depend on more.
+    fn is_repeatable(&self) -> bool {
+        false
+    }
+
     /// Whether an accepted hypothesis is good enough to become an instance at once, without waiting for the end of the
     /// contest. By default none is.
     fn is_sure(&self, verdict: &Verdict) -> bool {
@@ -230,6 +236,11 @@ impl Context<'_> {
     /// faces almost anywhere.
     #[must_use]
     pub fn refined(&self, detail: Detail, hypothesis: Hypothesis) -> Option<Hypothesis> {
+        self.polished(detail, hypothesis).and_then(Polished::if_supported)
+    }
+
+    /// The same, whether the correspondences still agree or not.
+    pub(crate) fn polished(&self, detail: Detail, hypothesis: Hypothesis) -> Option<Polished> {
         let target_from_source = match self.params.refine {
             Refine::None => return None,
             Refine::Icp | Refine::IcpTurns => {
@@ -238,13 +249,26 @@ impl Context<'_> {
         };
         let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
         let is_supported = support >= self.params.t_s as usize;
-        is_supported.then_some(Hypothesis { target_from_source, ..hypothesis })
+        Some(Polished { hypothesis: Hypothesis { target_from_source, ..hypothesis }, is_supported })
     }
 
     /// The random stream of `stage` in this round, and no other's.
     #[must_use]
     pub fn rng(&self, stage: Stage) -> Rng {
         Rng::new(self.params.seed, self.round, stage as u32)
+    }
+}
+
+/// A hypothesis polished on the clouds, and whether enough correspondences still agree with it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Polished {
+    pub(crate) hypothesis: Hypothesis,
+    is_supported: bool,
+}
+
+impl Polished {
+    pub(crate) fn if_supported(self) -> Option<Hypothesis> {
+        self.is_supported.then_some(self.hypothesis)
     }
 }
 

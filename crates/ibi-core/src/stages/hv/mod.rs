@@ -36,6 +36,10 @@ impl Validate for Hv {
         }
     }
 
+    fn is_repeatable(&self) -> bool {
+        true
+    }
+
     fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
         match self {
             Self::Evidence(evidence) => evidence.glance(context, hypothesis),
