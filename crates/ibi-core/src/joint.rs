@@ -4,6 +4,7 @@
 //! that a wrong early pose cannot live on what belongs to a right later one.
 
 use crate::correspondence::Alive;
+use crate::kernels::par;
 use crate::params::Params;
 use crate::stages::{Context, Validate};
 use crate::state::{Found, Problem};
@@ -34,15 +35,18 @@ pub(crate) fn joint_check(problem: &Problem<'_>, params: &Params, hv: &dyn Valid
     let everything = Alive::all(&problem.pairs);
     while found.len() > 1 {
         let context = problem.context_of(params, 0, &everything, found);
-        let margin = |(at, instance): (usize, &Found)| {
+        context.chance(); // not from within the map
+        let margins = par::map(found.len(), 1, |at| {
+            let instance = &found[at];
             if context.claims.against(at).near(instance.pose()).is_empty() {
                 return None; // as when it was accepted
             }
             let verdict = alone(&context, at, instance, |own| hv.validate(own, &instance.hypothesis));
             (!verdict.accepted()).then_some((at, verdict.value - verdict.threshold))
+        });
+        let Some((worst, _)) = margins.into_iter().flatten().min_by(|(_, a), (_, b)| a.total_cmp(b)) else {
+            return;
         };
-        let failed = found.iter().enumerate().filter_map(margin);
-        let Some((worst, _)) = failed.min_by(|(_, a), (_, b)| a.total_cmp(b)) else { return };
         found.remove(worst);
     }
 }
