@@ -136,7 +136,7 @@ impl Context<'_> {
     pub fn spent(&self, target_from_source: &Isometry3<f64>) -> Vec<u32> {
         let mut spent = self.inliers(target_from_source, 2.0 * self.params.t_he_pr);
         spent.extend(
-            self.near(Detail::Look, self.params.d_op_pr, target_from_source)
+            self.near(usize::MAX, self.params.d_op_pr, target_from_source)
                 .found
                 .into_iter()
                 .map(|(id, ..)| id),
@@ -147,15 +147,12 @@ impl Context<'_> {
     }
 
     /// Alive correspondences whose target point lies within `distance_pr` of the moved source, each with the row of the
-    /// nearest source point and the distance in data units. At a glance only some: every so many-th of those around.
-    fn near(&self, detail: Detail, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Near {
+    /// nearest source point and the distance in data units. Of more than `most` around only every so many-th.
+    fn near(&self, most: usize, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Near {
         let scene = self.scene;
         let around = self.around(distance_pr, target_from_source);
         let ids: Vec<u32> = around.filter(|&id| self.alive.contains(id)).collect();
-        let step = match detail {
-            Detail::Glance => ids.len().div_ceil(GLANCE_NEAR).max(1),
-            Detail::Look => 1,
-        };
+        let step = ids.len().div_ceil(most).max(1);
         let targets = ids.iter().step_by(step).map(|&id| (id, self.pairs.target[id as usize]));
         Near { found: scene.nearest_source(distance_pr, target_from_source, targets), step: step as u32 }
     }
@@ -179,24 +176,26 @@ impl Context<'_> {
         let reach_pr = 2.0 * self.params.d_op_pr;
         let (reach, d_op) = (self.length(reach_pr), self.length(self.params.d_op_pr));
         let t_he = self.length(self.params.t_he_pr);
-        let Near { found: near, step } = self.near(detail, reach_pr, target_from_source);
+        let most = match detail {
+            Detail::Glance => GLANCE_NEAR,
+            Detail::Look => LOOK_NEAR,
+        };
+        let Near { found: near, step } = self.near(most, reach_pr, target_from_source);
         let back_fit = near.iter().map(|&(_, _, distance)| 1.0 - distance / reach).sum::<f64>();
         let explained = near.iter().filter(|&&(_, _, distance)| distance <= d_op);
         let expected: f64 =
             explained.clone().map(|&(_, row, _)| f64::from(chance.agreement[row as usize])).sum();
         let num_explained = explained.clone().count();
-        let num_agreeing = match detail {
-            // The agreeing ones are few and found by themselves.
-            Detail::Glance => {
-                self.inliers(target_from_source, self.params.t_he_pr.min(self.params.d_op_pr)).len()
-            }
-            Detail::Look => explained
-                .filter(|&&(id, ..)| {
-                    let (p, q) = (self.pairs.source[id as usize], self.pairs.target[id as usize]);
-                    let is_close = (target_from_source * p - q).norm_squared() < t_he * t_he;
-                    is_close && self.normals_agree(id, target_from_source)
-                })
-                .count(),
+        let num_agreeing = if step > 1 {
+            // The agreeing ones are found by themselves.
+            self.inliers(target_from_source, self.params.t_he_pr.min(self.params.d_op_pr)).len()
+        } else {
+            let agrees = |&&(id, ..): &&(u32, u32, f64)| {
+                let (p, q) = (self.pairs.source[id as usize], self.pairs.target[id as usize]);
+                let is_close = (target_from_source * p - q).norm_squared() < t_he * t_he;
+                is_close && self.normals_agree(id, target_from_source)
+            };
+            explained.filter(agrees).count()
         };
         let claims = self.claims.near(target_from_source);
         let fit =
@@ -279,8 +278,9 @@ struct Near {
     step: u32,
 }
 
-/// Correspondences near a pose that are looked at for a glance.
+/// Correspondences near a pose that are looked at for a glance, and for more.
 const GLANCE_NEAR: usize = 128;
+const LOOK_NEAR: usize = 1024;
 
 /// What chance brings in a scene.
 #[derive(Debug)]

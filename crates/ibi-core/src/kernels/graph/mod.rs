@@ -251,31 +251,32 @@ impl Edges {
     /// is one of `lowest`. Each triangle is found once, at its lowest edge, and adds to all its three edges.
     fn common(&self, lowest: Range<usize>, interrupted: &impl Fn() -> bool) -> Vec<f32> {
         let mut common = vec![0.0_f32; self.neighbors.len()];
-        // w_ik, and the sum over j between i and k of w_ij w_jk: by k, for one i.
-        let (mut weight_to, mut between) = (vec![0.0_f32; self.len()], vec![0.0_f32; self.len()]);
+        // By k, for one i: w_ik, and the sum over j between i and k of w_ij w_jk. Side by side: what is read at random is
+        // one place and not two.
+        let mut third = vec![[0.0_f32; 2]; self.len()];
         for i in lowest {
             if interrupted() {
                 return common;
             }
             let (range, neighbors, weights) = self.row(i);
             for (&k, &w) in neighbors.iter().zip(weights) {
-                weight_to[k as usize] = w;
+                third[k as usize] = [w, 0.0];
             }
             for (at_ij, (&j, &w_ij)) in range.clone().zip(neighbors.iter().zip(weights)) {
-                let (range, third, w_third) = self.row(j as usize);
+                let (range, ks, w_jks) = self.row(j as usize);
                 let mut sum = 0.0;
-                for ((&k, &w_jk), common_jk) in third.iter().zip(w_third).zip(&mut common[range]) {
-                    let w_ik = weight_to[k as usize];
-                    sum += w_ik * w_jk;
-                    *common_jk += w_ij * w_ik;
-                    // Most k are no neighbours of i: a product with 0 costs less than a wrong guess.
-                    between[k as usize] += if w_ik > 0.0 { w_ij * w_jk } else { 0.0 };
+                for ((&k, &w_jk), common_jk) in ks.iter().zip(w_jks).zip(&mut common[range]) {
+                    let [w_ik, between] = &mut third[k as usize];
+                    sum += *w_ik * w_jk;
+                    *common_jk += w_ij * *w_ik;
+                    // Most k are no neighbours of i: a sum that nobody asks for costs less than a wrong guess.
+                    *between += w_ij * w_jk;
                 }
                 common[at_ij] += sum;
             }
             for (at_ik, &k) in range.zip(neighbors) {
-                common[at_ik] += between[k as usize];
-                (weight_to[k as usize], between[k as usize]) = (0.0, 0.0);
+                common[at_ik] += third[k as usize][1];
+                third[k as usize] = [0.0; 2];
             }
         }
         common
