@@ -4,13 +4,14 @@ use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Point3, Vector3};
 
+use crate::cloud::{PreparedCloud, check_points};
 use crate::error::{Argument, Error};
 use crate::kernels::by_target::ByTarget;
 use crate::kernels::columns::Columns;
 use crate::kernels::graph::{PairNormals, up_to_sign};
 use crate::kernels::par;
 use crate::params::Params;
-use crate::scene::{PreparedCloud, Scene, check_points};
+use crate::scene::Scene;
 
 /// Correspondences as a user hands them in: nothing is checked until a [`crate::Registrar`] takes them.
 ///

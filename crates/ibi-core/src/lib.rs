@@ -24,6 +24,7 @@
 
 mod checks;
 mod claims;
+mod cloud;
 mod correspondence;
 mod error;
 pub mod features;
@@ -40,6 +41,7 @@ mod state;
 mod symmetries;
 
 pub use claims::{Claims, NearClaims};
+pub use cloud::{Cloud, PreparedCloud};
 pub use correspondence::{Alive, Correspondences, PointPairs};
 pub use error::{Argument, Error};
 pub use interrupt::{CancelToken, Interrupt};
@@ -47,6 +49,6 @@ pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};
 pub use registration::{Pose, Registration, Round, StopReason, Timings};
-pub use scene::{Cloud, Detail, PreparedCloud, Scene};
+pub use scene::{Detail, Scene};
 pub use state::State;
 pub use symmetries::{Axis, BOP_STEP, FindSymmetries, Symmetries, SymmetryError, Turning, find_symmetries};

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use nalgebra::Isometry3;
 
+use crate::cloud::{Cloud, PreparedCloud, check_points};
 use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
@@ -13,7 +14,7 @@ use crate::joint::joint_check;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
-use crate::scene::{Cloud, Detail, PreparedCloud, Scene, check_points};
+use crate::scene::{Detail, Scene};
 use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Polished, Ranked, SelectSeeds, Validate};
 use crate::state::{Judged, Play, Problem, State, Tried};
 
@@ -270,7 +271,7 @@ impl<'a> Registrar<'a> {
         state.problem.interrupt.check()?;
         state.timings.add(&play.timings);
         if play.seeds.len() < self.params.t_s as usize {
-            if state.end_first_look(true) {
+            if state.end_first_look() {
                 return self.round(state);
             }
             let (value, threshold) = (play.seeds.len() as u32, self.params.t_s);
@@ -282,7 +283,9 @@ impl<'a> Registrar<'a> {
             state.turn_best(&self.params, self.hv());
             state.accept_best(&self.params, f64::NEG_INFINITY);
         }
-        state.end_first_look(state.num_rejections() >= FIRST_REJECTIONS);
+        if state.num_rejections() >= FIRST_REJECTIONS {
+            state.end_first_look();
+        }
         if state.rounds_since_settling >= self.params.n_contest {
             self.settle(state);
         }

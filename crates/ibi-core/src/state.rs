@@ -222,10 +222,10 @@ impl<'a> State<'a> {
         }
     }
 
-    /// Ends the first look, if there is one and `is_over`; returns whether it did.
-    pub(crate) fn end_first_look(&mut self, is_over: bool) -> bool {
+    /// Ends the first look, if there is one; returns whether there was.
+    pub(crate) fn end_first_look(&mut self) -> bool {
         let Problem { graph, is_first_look, .. } = &mut self.problem;
-        let ends = is_over && *is_first_look && graph.get().is_some_and(Graph::is_sample);
+        let ends = *is_first_look && graph.get().is_some_and(Graph::is_sample);
         if ends {
             (*graph, *is_first_look) = (OnceLock::new(), false);
             self.ahead = None;

@@ -122,8 +122,7 @@ fn fitness(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
 /// Players of whom a matrix stays in the cache.
 const FEW: usize = 128;
 
-/// The same as x^T Pi, which is the same as Pi is symmetric: a sum over rows needs no sum over lanes, and the extinct are
-/// passed over.
+/// The same for few, as x^T Pi, since Pi is symmetric: a sum of rows needs no sum over lanes, and passes over the extinct.
 fn fitness_of_few(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
     let (n, stride) = (*n, *stride);
     let mut fitness = vec![0.0; stride];

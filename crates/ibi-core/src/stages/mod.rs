@@ -91,9 +91,10 @@ pub struct Context<'a> {
     pub barred: &'a [bool],
     /// Which scene points accepted instances explain.
     pub claims: Claims<'a>,
-    /// The compatibility graph of all correspondences, built by the first stage that wants it.
+    /// The compatibility graph of the alive correspondences or, at a first look, of a part of them; built by the first
+    /// stage that wants it.
     pub graph: &'a OnceLock<Graph>,
-    /// Whether a part of the correspondences will do for the graph: once nothing more comes of it, another is built.
+    /// Whether a part of the correspondences will do for the graph: once nothing more comes of it, one of all is wanted.
     pub is_first_look: bool,
     /// Where each correspondence puts the centroid of the source, in the frame of the columns, if anywhere; filled by the
     /// first stage that wants it.

@@ -37,20 +37,13 @@ impl Places {
         self.kept(&is_kept)
     }
 
-    /// So many of them, evenly spread, that about `max_vicinity` lie around each.
+    /// So many of them that about `max_vicinity` lie around each.
     pub(super) fn sampled(self, max_vicinity: u32) -> Self {
-        let mut num_many = 0;
-        let mut is_kept = vec![true; self.len()];
-        for (home, runs) in &self.cells {
+        let vicinities = self.cells.iter().flat_map(|(home, runs)| {
             let num: usize = runs.iter().map(Range::len).sum();
-            if num > max_vicinity as usize {
-                let share = f64::from(max_vicinity) / num as f64;
-                for place in home.clone() {
-                    num_many += 1;
-                    is_kept[place] = out_of_step(num_many) < share;
-                }
-            }
-        }
+            home.clone().map(move |_| num as f32)
+        });
+        let is_kept = thinned(vicinities, max_vicinity);
         self.kept(&is_kept)
     }
 
@@ -69,8 +62,7 @@ impl Places {
         let moved = |run: &Range<usize>| before[run.start]..before[run.end];
         let cells = self.cells.iter().filter_map(|(home, runs)| {
             let home = moved(home);
-            let runs = || runs.iter().map(moved).filter(|run| !run.is_empty()).collect();
-            (!home.is_empty()).then(|| (home, runs()))
+            (!home.is_empty()).then(|| (home, runs.iter().map(moved).filter(|run| !run.is_empty()).collect()))
         });
         let cells = cells.collect();
         let kept: Vec<u32> = (0..self.ids.len() as u32).filter(|&place| is_kept[place as usize]).collect();
@@ -99,7 +91,7 @@ impl Finder<'_> {
     /// The correspondences of the nodes, and the edges weighed by w_ij = 1 - (r / tau)^2.
     pub(super) fn find(mut self, interrupted: &(impl Fn() -> bool + Sync)) -> (Vec<u32>, Edges) {
         let degrees = self.map_cells(|home, runs| self.estimated_degrees(home, runs));
-        self.places = self.places.kept(&thinned(&degrees.concat(), self.test.max_degree));
+        self.places = self.places.kept(&thinned(degrees.concat(), self.test.max_degree));
         let upper = self.map_cells(|home, runs| {
             let mut rows = Rows::default();
             if interrupted() {
@@ -293,19 +285,19 @@ fn bits(flags: &[u8; LANES]) -> u64 {
     flags.as_chunks::<8>().0.iter().enumerate().fold(0, |bits, (k, flags)| bits | eight(flags) << (8 * k))
 }
 
-/// Which places become nodes: of those with too many neighbours (as estimated) about as many as leave each
-/// `max_degree`, evenly spread over the places, which are in the order of the grid.
-fn thinned(degrees: &[f32], max_degree: u32) -> Vec<bool> {
-    let most = max_degree as f32;
+/// Which places are kept where `crowds` tells how many neighbours each has: of those with more than `most` about so many
+/// that each is left with `most`, evenly spread over the places, which are in the order of the grid.
+fn thinned(crowds: impl IntoIterator<Item = f32>, most: u32) -> Vec<bool> {
+    let most = most as f32;
     let mut num_too_many = 0;
-    let is_node = degrees.iter().map(|&degree| {
-        if degree <= most {
+    let is_kept = crowds.into_iter().map(|crowd| {
+        if crowd <= most {
             return true;
         }
         num_too_many += 1;
-        out_of_step(num_too_many) < f64::from(most / degree)
+        out_of_step(num_too_many) < f64::from(most / crowd)
     });
-    is_node.collect()
+    is_kept.collect()
 }
 
 /// Evenly spread over 0..1, and in step with no period of the list: the fractional part of i times the golden ratio. A

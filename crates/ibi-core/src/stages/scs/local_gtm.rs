@@ -25,8 +25,8 @@ const FIRST_FUTILE: u32 = 8;
 /// second-order compatibility graph of *all* correspondences.
 ///
 /// The correspondence with the most support leads; it and its neighbours play. One instance cannot be pulled
-/// apart by twenty equal ones, as in the global game, and nothing is drawn at random. The graph is built once
-/// and serves all rounds.
+/// apart by twenty equal ones, as in the global game, and nothing is drawn at random. A graph
+/// serves many rounds: a first one of a part of the correspondences, then one of all that are left.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(
     feature = "serde",
