@@ -1,6 +1,6 @@
 //! What accepted instances explain of the scene, and is therefore not free for others.
 
-use nalgebra::{Isometry3, Point3, Rotation3, Vector3};
+use nalgebra::Isometry3;
 
 use crate::params::Params;
 use crate::scene::Scene;
@@ -11,8 +11,8 @@ use crate::state::Found;
 #[derive(Debug, Clone, Copy)]
 pub struct Claims<'a> {
     scene: &'a Scene<'a>,
-    /// `d_op` in data units.
-    distance: f64,
+    /// `d_op` in pr.
+    distance_pr: f64,
     found: &'a [Found],
     /// An instance against all others: its is what it is nearest to.
     defendant: Option<usize>,
@@ -21,7 +21,7 @@ pub struct Claims<'a> {
 impl<'a> Claims<'a> {
     /// What is not free any more: the claims of all.
     pub(crate) fn new(scene: &'a Scene<'a>, params: &Params, found: &'a [Found]) -> Self {
-        Self { scene, distance: params.d_op_pr * scene.resolution, found, defendant: None }
+        Self { scene, distance_pr: params.d_op_pr, found, defendant: None }
     }
 
     /// What others explain better than the instance does; of equals the one found first.
@@ -38,91 +38,70 @@ impl<'a> Claims<'a> {
     /// Whether an accepted instance explains a row of the target. For many rows near one pose ask [`Self::near`].
     #[must_use]
     pub fn contains(&self, row: u32) -> bool {
-        self.of(|_| true).contains(row)
+        self.of(|_| true).contain(&[row])[0]
     }
 
     /// The claims that matter for target points within 2 `d_op` of the source as a pose has moved it.
     #[must_use]
     pub fn near(&self, target_from_source: &Isometry3<f64>) -> NearClaims<'a> {
         let source = self.scene.source;
-        let reach = 2.0 * source.radius + 3.0 * self.distance;
+        let reach = 2.0 * source.radius + 3.0 * self.distance_pr * self.scene.resolution;
         let centre = target_from_source * source.centre;
         self.of(|other| (other * source.centre - centre).norm() <= reach)
     }
 
     fn of(&self, is_near: impl Fn(&Isometry3<f64>) -> bool) -> NearClaims<'a> {
-        let claimant = |instance: usize| {
-            let pose = self.found[instance].pose();
-            (self.defendant != Some(instance) && is_near(pose))
-                .then(|| Claimant::new(self.scene, instance, pose))
-        };
-        let near: Vec<Claimant> = (0..self.found.len()).filter_map(claimant).collect();
-        let defendant = self.defendant.filter(|_| !near.is_empty());
-        let defendant = defendant.map(|at| Claimant::new(self.scene, at, self.found[at].pose()));
-        NearClaims { scene: self.scene, distance: self.distance, near, defendant }
+        let Self { found, defendant, .. } = *self;
+        let is_claimant = |&at: &usize| defendant != Some(at) && is_near(found[at].pose());
+        NearClaims { claims: *self, near: (0..found.len()).filter(is_claimant).collect() }
+    }
+
+    /// Of `rows` of the target, each given with a key, those that an instance explains, and how far they are from it.
+    fn explained_by(
+        &self,
+        instance: usize,
+        rows: impl Iterator<Item = (usize, u32)>,
+    ) -> impl Iterator<Item = (usize, f64)> {
+        let points = rows.map(|(key, row)| (key, self.scene.target.points[row as usize]));
+        let explained = self.scene.nearest_source(self.distance_pr, self.found[instance].pose(), points);
+        explained.into_iter().map(|(key, _, gap)| (key, gap))
     }
 }
 
 /// [`Claims`] of the instances that can have to do with the target points near a pose.
 #[derive(Debug)]
 pub struct NearClaims<'a> {
-    scene: &'a Scene<'a>,
-    distance: f64,
-    near: Vec<Claimant>,
-    defendant: Option<Claimant>,
+    claims: Claims<'a>,
+    near: Vec<usize>,
 }
 
 impl NearClaims<'_> {
-    /// Whether one of the instances explains a row of the target.
+    /// Which of `rows` of the target one of the instances explains.
     #[must_use]
-    pub fn contains(&self, row: u32) -> bool {
-        let point = &self.scene.target.points[row as usize];
-        let gap =
-            |claimant: &Claimant| Some((claimant.gap(self.scene, point, self.distance)?, claimant.instance));
-        let is_better = |claim: (f64, usize)| match self.defendant.as_ref().and_then(gap) {
-            Some(own) => claim < own,
-            None => true,
-        };
-        self.near.iter().filter_map(gap).any(is_better)
+    pub fn contain(&self, rows: &[u32]) -> Vec<bool> {
+        let claims = &self.claims;
+        let keyed = || rows.iter().copied().enumerate();
+        // The best claim to each row: how far it is from the instance, and from which.
+        let mut best: Vec<Option<(f64, usize)>> = vec![None; rows.len()];
+        for &instance in &self.near {
+            for (at, gap) in claims.explained_by(instance, keyed()) {
+                let claim = (gap, instance);
+                best[at] = Some(best[at].map_or(claim, |best| if claim < best { claim } else { best }));
+            }
+        }
+        let mut is_claimed: Vec<bool> = best.iter().map(Option::is_some).collect();
+        if let Some(instance) = claims.defendant {
+            let disputed = keyed().filter(|&(at, _)| best[at].is_some());
+            for (at, gap) in claims.explained_by(instance, disputed) {
+                is_claimed[at] = best[at] < Some((gap, instance));
+            }
+        }
+        is_claimed
     }
 
     /// Whether no instance is near.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.near.is_empty()
-    }
-}
-
-/// An accepted pose, ready to tell how far a target point is from it.
-#[derive(Debug)]
-struct Claimant {
-    instance: usize,
-    /// Of the source, as the pose has moved it.
-    centre: Point3<f64>,
-    rotation_back: Rotation3<f64>,
-    shift_back: Vector3<f64>,
-}
-
-impl Claimant {
-    fn new(scene: &Scene<'_>, instance: usize, target_from_source: &Isometry3<f64>) -> Self {
-        let back = target_from_source.inverse();
-        Self {
-            instance,
-            centre: target_from_source * scene.source.centre,
-            rotation_back: back.rotation.to_rotation_matrix(),
-            shift_back: back.translation.vector,
-        }
-    }
-
-    /// How far `point` is from the nearest point of the moved source, data units; `None` beyond `distance`, which is at
-    /// most 2 `d_op`.
-    fn gap(&self, scene: &Scene<'_>, point: &Point3<f64>, distance: f64) -> Option<f64> {
-        let radius = scene.source.radius + distance;
-        if (point - self.centre).norm_squared() > radius * radius {
-            return None;
-        }
-        let moved = self.rotation_back * point + self.shift_back;
-        let row = scene.near_source.nearest_within(&moved, distance)?;
-        Some((moved - scene.source.points[row as usize]).norm()).filter(|&gap| gap <= distance)
     }
 }

@@ -22,9 +22,10 @@ pub(crate) fn alone<T>(
     if near.is_empty() {
         return ask(&Context { claims, ..*context });
     }
-    let is_claimed = |&id: &u32| near.contains(context.pairs.target_rows[id as usize]);
-    let claimed: Vec<u32> =
-        context.around(2.0 * context.params.d_op_pr, found.pose()).filter(is_claimed).collect();
+    let around: Vec<u32> = context.around(2.0 * context.params.d_op_pr, found.pose()).collect();
+    let rows: Vec<u32> = around.iter().map(|&id| context.pairs.target_rows[id as usize]).collect();
+    let claimed = around.iter().zip(near.contain(&rows)).filter(|&(_, is_claimed)| is_claimed);
+    let claimed: Vec<u32> = claimed.map(|(&id, _)| id).collect();
     let mut alive = Alive::all(context.pairs);
     alive.remove(&claimed);
     ask(&Context { claims, alive: &alive, ..*context })

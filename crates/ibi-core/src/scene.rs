@@ -103,10 +103,10 @@ impl Scene<'_> {
         params: &Params,
         detail: Detail,
         target_from_source: &Isometry3<f64>,
-        is_claimed: impl Fn(u32) -> bool + Sync,
+        are_claimed: impl Fn(&[u32]) -> Vec<bool> + Sync,
     ) -> Fit {
         let (source, target, contact) = self.probed(params, detail);
-        fit(&source, &target, &self.near_target, target_from_source, &contact, is_claimed)
+        fit(&source, &target, &self.near_target, target_from_source, &contact, are_claimed)
     }
 
     /// The fit that chance gives a pose somewhere on the target.
@@ -146,15 +146,14 @@ impl Scene<'_> {
             let moved = rotation * point + shift;
             ((moved - centre).norm_squared() <= radius * radius).then_some((key, moved))
         });
-        let mut found = Vec::new();
-        self.near_source.nearest_each(distance, near, |key, moved, row| {
-            let Some(row) = row else { return };
+        let (keys, moved): (Vec<K>, Vec<_>) = near.unzip();
+        let nearest = self.near_source.nearest_each(distance, &moved);
+        let found = keys.into_iter().zip(&moved).zip(nearest).filter_map(|((key, moved), row)| {
+            let row = row?;
             let gap = (moved - self.source.points[row as usize]).norm();
-            if gap <= distance {
-                found.push((key, row, gap));
-            }
+            (gap <= distance).then_some((key, row, gap))
         });
-        found
+        found.collect()
     }
 
     /// The pose polished on the two clouds by ICP within 2 `d_op`: on few points for a first glance, which brings a

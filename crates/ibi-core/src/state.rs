@@ -391,7 +391,7 @@ impl<'a> State<'a> {
         let mut glances = par::map(turns.len(), 1, |i| {
             let pose = scene.icp(params, Detail::Glance, &(hypothesis.target_from_source * turns[i]));
             let claims = context.claims.near(&pose);
-            (scene.fit(params, Detail::Glance, &pose, |row| claims.contains(row)).share, pose)
+            (scene.fit(params, Detail::Glance, &pose, |rows| claims.contain(rows)).share, pose)
         });
         glances.sort_by(|(a, _), (b, _)| b.total_cmp(a));
         let mut best = (value, hypothesis);

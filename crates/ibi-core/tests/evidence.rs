@@ -146,8 +146,9 @@ fn fit_of(
     with_normals: bool,
 ) -> f64 {
     let near = Nearby::new(&target.points, contact.distance);
-    let is_claimed = |row: u32| claimed.is_some_and(|claimed| claimed[row as usize]);
-    fit(&source.surface(with_normals), &target.surface(with_normals), &near, pose, contact, is_claimed).mean
+    let are_claimed =
+        |rows: &[u32]| rows.iter().map(|&row| claimed.is_some_and(|claimed| claimed[row as usize])).collect();
+    fit(&source.surface(with_normals), &target.surface(with_normals), &near, pose, contact, are_claimed).mean
 }
 
 proptest! {
@@ -212,7 +213,7 @@ proptest! {
             let (from, to) = (source.surface(true), target.surface(true));
             (
                 places(&from, &to, &near, &pose, contact),
-                fit(&from, &to, &near, &pose, contact, |_| false).mean.to_bits(),
+                fit(&from, &to, &near, &pose, contact, |rows| vec![false; rows.len()]).mean.to_bits(),
                 chance_fit(&from, &to, &near, contact, Rng::new(seed, 0, 0), 50).to_bits(),
             )
         };

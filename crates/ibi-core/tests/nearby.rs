@@ -72,13 +72,7 @@ fn check_nearby(cloud: &[Point3<f64>], reach: f64, queries: &[Point3<f64>]) {
             check_within(&nearby, cloud, query, distance, doubt + RELATIVE * distance);
         }
     }
-    // Queries come back with their keys, each once and in order.
-    let mut told = Vec::new();
-    nearby.nearest_each(nearby.reach(), queries.iter().copied().enumerate(), |key, query, row| {
-        told.push((key, *query, row));
-    });
-    let asked = queries.iter().zip(&rows).enumerate();
-    assert!(told.into_iter().eq(asked.map(|(key, (query, row))| (key, *query, *row))));
+    assert_eq!(nearby.nearest_each(reach, queries), rows, "all at once as one by one");
 }
 
 fn check_within(nearby: &Nearby, cloud: &[Point3<f64>], query: &Point3<f64>, distance: f64, doubt: f64) {
@@ -178,7 +172,8 @@ fn few_points() {
     let empty = Nearby::new(&[], 1.0);
     assert_eq!((empty.nearest(&here), empty.nearest(&Point3::origin())), (None, None));
     assert_eq!(empty.within(&Point3::origin(), 1e9).count(), 0);
-    empty.nearest_each(1.0, [(7, here)], |key, _, row| assert_eq!((key, row), (7, None)));
+    assert_eq!(empty.nearest_each(1.0, &[here, here]), [None, None]);
+    assert_eq!(empty.nearest_each(1.0, &[]), []);
     for reach in [1e-6, 0.499, 0.501, 1e9] {
         let one = Nearby::new(&[here], reach);
         assert_eq!(one.nearest(&here), Some(0));
@@ -384,7 +379,7 @@ fn points_on_the_borders_and_in_the_middles_of_cells_are_found() {
             let cloud: Vec<_> = (0..12 * COPIES).map(|i| point(i / COPIES)).collect();
             let nearby = Nearby::new(&cloud, 1.0);
             for k in 0..12 {
-                let near = nearby.nearest_within(&point(k), 0.5);
+                let near = nearby.nearest_each(0.5, &[point(k)])[0];
                 assert_eq!(near.map(|row| row / COPIES), Some(k), "{half} {axis}");
             }
         }

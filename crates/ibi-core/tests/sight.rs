@@ -191,7 +191,7 @@ fn across_the_surface_a_fit_does_not_see_how_the_scan_is_sampled() {
     let near = Nearby::new(&scene.wall, 0.1);
     let at = |x: f64, z: f64| {
         let pose = Isometry3::translation(x, 0.0, z);
-        fit(&scene.source(), &scene.wall(), &near, &pose, &scene.contact(), |_| false)
+        fit(&scene.source(), &scene.wall(), &near, &pose, &scene.contact(), |rows| vec![false; rows.len()])
     };
     for x in [0.0, 0.007, 0.02] {
         assert!((at(x, 4.0).mean - 1.0).abs() < 1e-12);
@@ -202,10 +202,14 @@ fn across_the_surface_a_fit_does_not_see_how_the_scan_is_sampled() {
     // Of a source of which half faces away, half is explained.
     let half: Vec<_> = (0..100).map(|i| if i % 2 == 0 { Vector3::z() } else { -Vector3::z() }).collect();
     let source = Surface { points: &scene.source, normals: Some(&half) };
-    let found =
-        fit(&source, &scene.wall(), &near, &Isometry3::translation(0.0, 0.0, 4.0), &scene.contact(), |_| {
-            false
-        });
+    let found = fit(
+        &source,
+        &scene.wall(),
+        &near,
+        &Isometry3::translation(0.0, 0.0, 4.0),
+        &scene.contact(),
+        |rows| vec![false; rows.len()],
+    );
     assert!((found.mean - 1.0).abs() < 1e-12 && (found.share - 0.5).abs() < 1e-12);
 }
 

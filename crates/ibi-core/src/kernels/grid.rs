@@ -10,7 +10,7 @@ pub struct Grid {
     low: [f32; 3],
     /// 1 / width of a cell, per axis.
     inv_cell: [f32; 3],
-    /// Cells per axis.
+    /// Cells per axis, two or more.
     shape: [usize; 3],
     /// The last cell of each axis.
     last: [f32; 3],
@@ -23,6 +23,9 @@ pub struct Grid {
 /// a column stand together anyhow and a few more cost nothing, then on all axes.
 const MIN_CELLS: usize = 1 << 12;
 const CELLS_PER_POINT: usize = 4;
+
+/// Least width of a cell: a place far from the points is still a finite number of cells away.
+const MIN_CELL: f32 = 1e-15;
 
 /// Cells per axis at most: `f32` tells no more apart, and [`nearest_whole`] takes no more.
 const MAX_PER_AXIS: usize = 1 << 22;
@@ -47,9 +50,9 @@ impl Grid {
         let bounds = points.each_ref().map(|axis| bulk(axis));
         let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
         let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
-        let mut cell = cell.max(widest / max_cells.min(MAX_PER_AXIS) as f32).max(f32::MIN_POSITIVE);
-        let num = |axis: usize, cell: f32| ((bounds[axis].1 - bounds[axis].0) / cell) as usize + 1;
-        while num(0, cell).checked_mul(num(1, cell)).is_none_or(|columns| columns > max_cells) {
+        let mut cell = cell.max(widest / max_cells.min(MAX_PER_AXIS) as f32).max(MIN_CELL);
+        let num = |axis: usize, cell: f32| (((bounds[axis].1 - bounds[axis].0) / cell) as usize + 1).max(2);
+        while num(0, cell).checked_mul(num(1, cell)).is_none_or(|columns| columns > max_cells / 2) {
             cell *= 1.1;
         }
         let shape = [num(0, cell), num(1, cell)];
@@ -183,44 +186,30 @@ impl Grid {
     #[inline(always)]
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn block(&self, place: [f32; 3]) -> [Range<usize>; 4] {
-        let [x, y, z] = [0, 1, 2].map(|axis| {
+        let first = |axis: usize| {
             let at = (place[axis] - self.low[axis]) * self.inv_cell[axis];
-            // Half-way cases go to the even number: the second is not what is nearest to `at`, which may be two more.
-            let first = nearest_whole(at - 1.0, self.last[axis]);
-            [first, (first + 1).min(self.shape[axis] - 1)]
-        });
-        let run = |x: usize, y: usize| {
-            let row = self.index([x, y, 0]);
-            self.starts[row + z[0]] as usize..self.starts[row + z[1] + 1] as usize
+            nearest_whole(at - 1.0, self.last[axis] - 1.0)
         };
-        // At the rim both cells of an axis may be one.
-        let none = 0..0;
-        let (two_x, two_y) = (x[0] != x[1], y[0] != y[1]);
-        [
-            run(x[0], y[0]),
-            if two_y { run(x[0], y[1]) } else { none.clone() },
-            if two_x { run(x[1], y[0]) } else { none.clone() },
-            if two_x && two_y { run(x[1], y[1]) } else { none },
-        ]
+        let corner = self.index([first(0), first(1), first(2)]);
+        let (next_x, next_y) = (self.shape[1] * self.shape[2], self.shape[2]);
+        let run = |at: usize| self.starts[at] as usize..self.starts[at + 2] as usize;
+        [run(corner), run(corner + next_y), run(corner + next_x), run(corner + next_x + next_y)]
     }
 
-    /// Ranges of [`Self::order`] that hold every point within a cell (a little less) of `place`: of each axis three
-    /// neighbouring cells.
+    /// Hands ranges of [`Self::order`] to `look` that hold every point within a cell (a little less) of `place`: of each
+    /// axis three neighbouring cells.
     #[inline(always)]
     #[allow(clippy::inline_always)] // the head of an inner loop
-    pub(crate) fn wide_block(&self, place: [f32; 3]) -> [Range<usize>; 9] {
+    pub(crate) fn each_of_wide_block(&self, place: [f32; 3], mut look: impl FnMut(Range<usize>)) {
         let [x, y, z] = self.cell(place);
-        let end = self.shape[2];
-        std::array::from_fn(|i| {
-            // Beyond the rim there is no cell: an offset of -1 wraps around.
-            let (x, y) = ((x + i / 3).wrapping_sub(1), (y + i % 3).wrapping_sub(1));
-            if x >= self.shape[0] || y >= self.shape[1] {
-                return 0..0;
+        let end = |axis: usize, at: usize| (at + 2).min(self.shape[axis]);
+        let (first, last) = (z.saturating_sub(1), end(2, z));
+        for x in x.saturating_sub(1)..end(0, x) {
+            for y in y.saturating_sub(1)..end(1, y) {
+                let row = self.index([x, y, 0]);
+                look(self.starts[row + first] as usize..self.starts[row + last] as usize);
             }
-            let row = self.index([x, y, 0]);
-            let (first, last) = (z.saturating_sub(1), (z + 2).min(end));
-            self.starts[row + first] as usize..self.starts[row + last] as usize
-        })
+        }
     }
 
     /// How far `x` is from the cells `c` of an axis: 0 within, and beyond the rim, whose cells have no end.

@@ -13,9 +13,9 @@ const MAX_TURN_RAD: f64 = 0.2;
 /// Damping relative to the mean curvature: what the surface does not hold (a plane slides) stays where it is.
 const DAMPING: f64 = 1e-3;
 
-/// Polishes `start` until `stop` and returns the pose with the least cost among all it came by: the
-/// mean over the visible source points of min(d, distance)^2, d being the distance to the target (to its tangent
-/// planes where there are normals). So it is never worse than its start by its own measure.
+/// Polishes `start` until `stop` and returns the pose with the least cost among all it came by: the mean over the visible
+/// source points of min(d, distance)^2, d being the distance to the target (to its tangent planes where there are
+/// normals). So it is never worse than its start by its own measure, but for rounding.
 #[must_use]
 pub fn icp(
     source: &Surface<'_>,
@@ -34,21 +34,57 @@ pub fn icp(
         let seen = Surface { points: &points, normals: normals.as_deref() };
         return icp(&seen, target, nearby, start, &Contact { view: None, ..*contact }, stop);
     }
+    match target.normals {
+        Some(normals) => to_planes(source, target, normals, nearby, start, contact, stop),
+        None => to_points(source, target, nearby, start, contact, stop),
+    }
+}
+
+/// Point-to-point. No step makes the cost greater, so it need not be measured.
+fn to_points(
+    source: &Surface<'_>,
+    target: &Surface<'_>,
+    nearby: &Nearby,
+    start: &Isometry3<f64>,
+    contact: &Contact<'_>,
+    stop: Stop,
+) -> Isometry3<f64> {
+    let mut pose = *start;
+    for _ in 0..stop.steps {
+        let places = places(source, target, nearby, &pose, contact);
+        let touching = on(&places).map(|(i, row)| (&source.points[i], &target.points[row]));
+        let Some(next) = rigid_fit(touching) else { break };
+        let has_come_to_rest = is_same(&pose, &next, source, stop.shift * contact.distance);
+        pose = next;
+        if has_come_to_rest {
+            break;
+        }
+    }
+    pose
+}
+
+/// Point-to-plane.
+fn to_planes(
+    source: &Surface<'_>,
+    target: &Surface<'_>,
+    normals: &[Vector3<f64>],
+    nearby: &Nearby,
+    start: &Isometry3<f64>,
+    contact: &Contact<'_>,
+    stop: Stop,
+) -> Isometry3<f64> {
     let (mut pose, mut best) = (*start, (f64::INFINITY, *start));
     let mut has_come_to_rest = false;
     for step in 0..=stop.steps {
         let places = places(source, target, nearby, &pose, contact);
-        let cost = cost(source, target, &pose, contact, &places);
+        let cost = cost(source, target, normals, &pose, contact, &places);
         if cost < best.0 {
             best = (cost, pose);
         }
         if step == stop.steps || has_come_to_rest {
             break;
         }
-        let next = match target.normals {
-            Some(normals) => to_planes(source, target.points, normals, &pose, contact, &places),
-            None => rigid_fit(on(&places).map(|(i, row)| (&source.points[i], &target.points[row]))),
-        };
+        let next = step_to_planes(source, target.points, normals, &pose, contact, &places);
         let Some(next) = next else { break };
         has_come_to_rest = is_same(&pose, &next, source, stop.shift * contact.distance);
         pose = next;
@@ -93,6 +129,7 @@ fn on(places: &[Place]) -> impl Iterator<Item = (usize, usize)> + Clone + '_ {
 fn cost(
     source: &Surface<'_>,
     target: &Surface<'_>,
+    normals: &[Vector3<f64>],
     pose: &Isometry3<f64>,
     contact: &Contact<'_>,
     places: &[Place],
@@ -101,14 +138,13 @@ fn cost(
     let visible = places.iter().filter(|&&place| place != Place::Hidden).count();
     let touching = on(places).map(|(i, row)| {
         let gap = pose * source.points[i] - target.points[row];
-        let d_sq = target.normals.map_or(gap.norm_squared(), |normals| gap.dot(&normals[row]).powi(2));
-        d_sq - distance_sq
+        gap.dot(&normals[row]).powi(2) - distance_sq
     });
     touching.sum::<f64>() / visible.max(1) as f64 + distance_sq
 }
 
 /// One damped Gauss-Newton step of the point-to-plane distances.
-fn to_planes(
+fn step_to_planes(
     source: &Surface<'_>,
     target: &[Point3<f64>],
     normals: &[Vector3<f64>],

@@ -41,7 +41,6 @@ impl Nearby {
     pub fn new(points: &[Point3<f64>], reach: f64) -> Self {
         let middle = middle(points);
         let rows = columns(points, middle, reach);
-        // The reach is 1: a cell and its neighbours hold it.
         // The reach is 1. A cell and its neighbours hold it, and the blocks of two cells an axis half of it for sure.
         Self { sorted: Sorted::new(&rows, 1.005), middle, reach, inv_reach: 1.0 / reach }
     }
@@ -55,28 +54,16 @@ impl Nearby {
     /// The row of the point nearest to `query`, if one lies within the reach.
     #[must_use]
     pub fn nearest(&self, query: &Point3<f64>) -> Option<u32> {
-        self.nearest_within(query, self.reach)
+        self.nearest_each(self.reach, std::slice::from_ref(query))[0]
     }
 
-    /// The row of the point nearest to `query`, if one lies within `distance`, which is at most the reach.
+    /// The row of the point nearest to each of `queries`, if one lies within `distance`, up to rounding; it is at most the
+    /// reach. Within half the reach it is found in half the time.
     #[must_use]
-    pub fn nearest_within(&self, query: &Point3<f64>, distance: f64) -> Option<u32> {
-        let mut nearest = None;
-        self.nearest_each(distance, [((), *query)], |(), _, row| nearest = row);
-        nearest
-    }
-
-    /// Tells `found(key, query, row)` of each `(key, query)` the row of the nearest point, if one lies within
-    /// `distance`, up to rounding; it is at most the reach. Within half the reach it is found in half the time.
-    pub fn nearest_each<K>(
-        &self,
-        distance: f64,
-        queries: impl IntoIterator<Item = (K, Point3<f64>)>,
-        found: impl FnMut(K, &Point3<f64>, Option<u32>),
-    ) {
+    pub fn nearest_each(&self, distance: f64, queries: &[Point3<f64>]) -> Vec<Option<u32>> {
         // A little more, for rounding.
         let bound = (distance * self.inv_reach * (1.0 + 1e-6)) as f32;
-        dispatch(NearestEach { nearby: self, bound, queries: queries.into_iter(), found });
+        dispatch(NearestEach { nearby: self, bound, queries })
     }
 
     /// Rows of the points within `distance` of `query`, up to rounding, in no particular order. The distance may exceed
@@ -93,53 +80,61 @@ impl Nearby {
         })
     }
 
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // the head of an inner loop
     fn local(&self, query: &Point3<f64>) -> [f32; 3] {
-        [0, 1, 2].map(|axis| ((query[axis] - self.middle[axis]) * self.inv_reach) as f32)
+        let axis = |axis: usize| ((query[axis] - self.middle[axis]) * self.inv_reach) as f32;
+        [axis(0), axis(1), axis(2)]
     }
 
     #[inline(always)]
     #[allow(clippy::inline_always)] // the body of the loop above
-    fn row<S: Simd>(&self, simd: S, query: &Point3<f64>, bound: f32) -> Option<u32> {
+    fn row<S: Simd>(
+        &self,
+        simd: S,
+        columns: SortedColumns<'_>,
+        query: &Point3<f64>,
+        bound: f32,
+    ) -> Option<u32> {
         let q = self.local(query);
         let grid = &self.sorted.grid;
-        let mut search = Search::new(simd, &self.sorted, q, bound * bound);
+        let mut search = Search::new(simd, columns, q, bound * bound);
         for run in grid.block(q) {
             search.look::<false>(run, NONE);
         }
         // Most points of a pose that is right end here: they have a neighbour within half a cell.
-        let seen = SEEN * grid.cell_size();
-        let row = search.row_within(seen); // all that is searched for lies within `bound`
-        if bound <= seen || row.is_some() {
+        let row = search.row_within(columns.seen); // all that is searched for lies within `bound`
+        if bound <= columns.seen || row.is_some() {
             return row;
         }
-        for run in grid.wide_block(q) {
-            search.look::<false>(run, NONE);
-        }
+        grid.each_of_wide_block(
+            q,
+            #[inline(always)]
+            |run| search.look::<false>(run, NONE),
+        );
         search.row_within(f32::INFINITY)
     }
 }
 
 /// The loop of [`Nearby::nearest_each`].
-struct NearestEach<'a, I, F> {
+struct NearestEach<'a> {
     nearby: &'a Nearby,
     bound: f32,
-    queries: I,
-    found: F,
+    queries: &'a [Point3<f64>],
 }
 
-impl<K, I, F> WithSimd for NearestEach<'_, I, F>
-where
-    I: Iterator<Item = (K, Point3<f64>)>,
-    F: FnMut(K, &Point3<f64>, Option<u32>),
-{
-    type Output = ();
+impl WithSimd for NearestEach<'_> {
+    type Output = Vec<Option<u32>>;
 
     #[inline(always)]
     #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
-    fn with_simd<S: Simd>(mut self, simd: S) {
-        for (key, query) in self.queries {
-            (self.found)(key, &query, self.nearby.row(simd, &query, self.bound));
+    fn with_simd<S: Simd>(self, simd: S) -> Self::Output {
+        let mut rows = vec![None; self.queries.len()];
+        let columns = self.nearby.sorted.columns();
+        for (row, query) in rows.iter_mut().zip(self.queries) {
+            *row = self.nearby.row(simd, columns, query, self.bound);
         }
+        rows
     }
 }
 
@@ -212,6 +207,16 @@ impl Sorted {
         Self { grid, points, rows }
     }
 
+    #[inline]
+    fn columns(&self) -> SortedColumns<'_> {
+        let n = self.rows.len();
+        SortedColumns {
+            points: self.points.each_ref().map(|axis| &axis[..n]),
+            rows: &self.rows,
+            seen: SEEN * self.grid.cell_size(),
+        }
+    }
+
     /// One position of each of `count` equal stretches of the order, drawn at random; all if there are no more.
     fn strata(&self, count: usize) -> Vec<u32> {
         let n = self.grid.order().len();
@@ -236,19 +241,26 @@ impl Sorted {
     /// The row of the point nearest to that at `place`, which is itself `row`, if there is one in the cells around.
     #[inline(always)]
     #[allow(clippy::inline_always)] // the body of the loop below
-    fn near_other<S: Simd>(&self, simd: S, place: [f32; 3], row: u32) -> Option<u32> {
-        let seen = SEEN * self.grid.cell_size();
-        let mut search = Search::new(simd, self, place, f32::INFINITY);
+    fn near_other<S: Simd>(
+        &self,
+        simd: S,
+        columns: SortedColumns<'_>,
+        place: [f32; 3],
+        row: u32,
+    ) -> Option<u32> {
+        let mut search = Search::new(simd, columns, place, f32::INFINITY);
         for run in self.grid.block(place) {
             search.look::<true>(run, row);
         }
-        search.row_within(seen).or_else(
+        search.row_within(columns.seen).or_else(
             #[inline(always)]
             || {
-                for run in self.grid.wide_block(place) {
-                    search.look::<true>(run, row);
-                }
-                search.row_within(2.0 * seen)
+                self.grid.each_of_wide_block(
+                    place,
+                    #[inline(always)]
+                    |run| search.look::<true>(run, row),
+                );
+                search.row_within(2.0 * columns.seen)
             },
         )
     }
@@ -257,7 +269,7 @@ impl Sorted {
     #[inline(always)]
     #[allow(clippy::inline_always)] // as above
     fn nearest_other<S: Simd>(&self, simd: S, place: [f32; 3], row: u32) -> u32 {
-        let mut search = Search::new(simd, self, place, f32::INFINITY);
+        let mut search = Search::new(simd, self.columns(), place, f32::INFINITY);
         let mut radius = 0.5 * self.grid.cell_size();
         loop {
             for run in self.grid.around(place, radius) {
@@ -287,10 +299,11 @@ impl WithSimd for Spacings<'_> {
     #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
     fn with_simd<S: Simd>(self, simd: S) -> Vec<f64> {
         let sorted = self.sorted;
+        let columns = sorted.columns();
         let spacing = |&at: &u32| {
             let row = sorted.rows[at as usize];
             let place = sorted.points.each_ref().map(|axis| axis[at as usize]);
-            let other = match sorted.near_other(simd, place, row) {
+            let other = match sorted.near_other(simd, columns, place, row) {
                 Some(other) => other,
                 None => self.coarser.unwrap_or(sorted).nearest_other(simd, place, row),
             };
@@ -303,10 +316,19 @@ impl WithSimd for Spacings<'_> {
 /// What [`Grid::block`] holds for sure, in cells: half a one, less what rounding may cost.
 const SEEN: f32 = 0.499;
 
+/// The columns of [`Sorted`], all of one length for the compiler to see.
+#[derive(Clone, Copy)]
+struct SortedColumns<'a> {
+    points: [&'a [f32]; 3],
+    rows: &'a [u32],
+    /// What [`Grid::block`] holds for sure.
+    seen: f32,
+}
+
 /// A search for the point nearest to a place: the best so far, lane by lane.
 struct Search<'a, S: Simd> {
     simd: S,
-    sorted: &'a Sorted,
+    columns: SortedColumns<'a>,
     place: [S::f32s; 3],
     dist_sq: S::f32s,
     row: S::u32s,
@@ -315,11 +337,11 @@ struct Search<'a, S: Simd> {
 impl<'a, S: Simd> Search<'a, S> {
     #[inline(always)]
     #[allow(clippy::inline_always)]
-    fn new(simd: S, sorted: &'a Sorted, place: [f32; 3], within_sq: f32) -> Self {
+    fn new(simd: S, columns: SortedColumns<'a>, place: [f32; 3], within_sq: f32) -> Self {
         Self {
             simd,
-            sorted,
-            place: place.map(|x| simd.splat_f32s(x)),
+            columns,
+            place: [simd.splat_f32s(place[0]), simd.splat_f32s(place[1]), simd.splat_f32s(place[2])],
             dist_sq: simd.splat_f32s(within_sq),
             row: simd.splat_u32s(NONE),
         }
@@ -331,15 +353,17 @@ impl<'a, S: Simd> Search<'a, S> {
     #[allow(clippy::inline_always)] // the inner loop of every search
     fn look<const SKIP: bool>(&mut self, run: Range<usize>, skip: u32) {
         let simd = self.simd;
-        for start in run.step_by(S::F32_LANES) {
+        let mut start = run.start;
+        // Once in any case: most runs are short, and then no branch has to be guessed.
+        loop {
             let lanes = start..start + S::F32_LANES;
             let gap_sq = |axis: usize| {
-                let x = S::as_simd_f32s(&self.sorted.points[axis][lanes.clone()]).0[0];
+                let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
                 let gap = simd.sub_f32s(x, self.place[axis]);
                 simd.mul_f32s(gap, gap)
             };
             let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
-            let row = S::as_simd_u32s(&self.sorted.rows[lanes]).0[0];
+            let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
             let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
             if SKIP {
                 let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
@@ -347,6 +371,10 @@ impl<'a, S: Simd> Search<'a, S> {
             }
             self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
             self.row = simd.select_u32s(nearer, row, self.row);
+            start += S::F32_LANES;
+            if start >= run.end {
+                return;
+            }
         }
     }
 
@@ -354,17 +382,14 @@ impl<'a, S: Simd> Search<'a, S> {
     #[inline(always)]
     #[allow(clippy::inline_always)]
     fn row_within(&self, distance: f32) -> Option<u32> {
-        self.first().filter(|&(_, dist_sq)| dist_sq <= distance * distance).map(|(row, _)| row)
-    }
-
-    /// The nearest of all lanes, its row and squared distance.
-    #[inline(always)]
-    #[allow(clippy::inline_always)]
-    fn first(&self) -> Option<(u32, f32)> {
-        let least = self.simd.reduce_min_f32s(self.dist_sq);
-        // Lanes that saw nothing hold the bound that they began with, and are the least only if none saw anything.
-        let lane = self.simd.first_true_m32s(self.simd.equal_f32s(self.dist_sq, self.simd.splat_f32s(least)));
-        let row = bytemuck::cast_slice::<_, u32>(std::slice::from_ref(&self.row))[lane];
-        (row != NONE).then_some((row, least))
+        let simd = self.simd;
+        let least = simd.reduce_min_f32s(self.dist_sq);
+        // Lanes that saw nothing hold the bound that they began with, and are the least only if none saw anything. To look
+        // for the first lane that is the least would be to guess a branch for each.
+        let is_least = simd.equal_f32s(self.dist_sq, simd.splat_f32s(least));
+        let rows = simd.select_u32s(is_least, self.row, simd.splat_u32s(NONE));
+        let rows: &[u32] = bytemuck::cast_slice(std::slice::from_ref(&rows));
+        let row = rows.iter().fold(NONE, |least, &row| least.min(row));
+        (row != NONE && least <= distance * distance).then_some(row)
     }
 }

@@ -86,7 +86,7 @@ pub struct Fit {
     pub share: f64,
 }
 
-/// Measures the [`Fit`] of a pose.
+/// Measures the [`Fit`] of a pose. `are_claimed` tells of each row of the target whether it is claimed.
 ///
 /// # Complexity
 /// As [`places`].
@@ -97,17 +97,19 @@ pub fn fit(
     nearby: &Nearby,
     target_from_source: &Isometry3<f64>,
     contact: &Contact<'_>,
-    is_claimed: impl Fn(u32) -> bool + Sync,
+    are_claimed: impl Fn(&[u32]) -> Vec<bool> + Sync,
 ) -> Fit {
     let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
-        let (mut visible, mut sum) = (0_u32, 0.0);
+        let (mut visible, mut on, mut closeness) = (0_u32, Vec::new(), Vec::new());
         each_place(source, target, nearby, target_from_source, contact, rows, |_, place, gap| {
             visible += 1;
-            if matches!(place, Place::On(row) if !is_claimed(row)) {
-                sum += contact.closeness(target, place, gap);
+            if let Place::On(row) = place {
+                on.push(row);
+                closeness.push(contact.closeness(target, row, gap));
             }
         });
-        (visible, sum)
+        let free = closeness.iter().zip(are_claimed(&on)).filter(|&(_, is_claimed)| !is_claimed);
+        (visible, free.map(|(closeness, _)| closeness).sum::<f64>())
     });
     let visible: u32 = chunks.iter().map(|(visible, _)| visible).sum();
     let sum: f64 = chunks.iter().map(|(_, sum)| sum).sum();
@@ -125,17 +127,20 @@ pub fn chance_fit(
     mut rng: Rng,
     samples: usize,
 ) -> f64 {
-    let contact = Contact { view: None, ..*contact };
-    let mut sum = 0.0;
-    for _ in 0..samples {
+    let drawn = (0..samples).map(|_| {
         let [i, about] = [(); 2].map(|()| rng.below(source.points.len()));
         let onto = target.points[rng.below(target.points.len())];
         let rotation = rng.rotation();
-        let pose = Isometry3::from_parts((onto - rotation * source.points[about]).into(), rotation);
-        each_place(source, target, nearby, &pose, &contact, i..i + 1, |_, place, gap| {
-            sum += contact.closeness(target, place, gap);
-        });
-    }
+        let moved = onto + rotation * (source.points[i] - source.points[about]);
+        (moved, source.normals.map(|normals| rotation * normals[i]))
+    });
+    let (moved, normals): (Vec<_>, Vec<_>) = drawn.unzip();
+    let nearest = nearby.nearest_each(contact.distance, &moved);
+    let closeness = |((moved, normal), row): ((_, _), Option<u32>)| {
+        let (row, gap) = contact.gap(target, row?, moved, normal)?;
+        Some(contact.closeness(target, row, gap))
+    };
+    let sum: f64 = moved.iter().zip(normals).zip(nearest).filter_map(closeness).sum();
     sum / samples.max(1) as f64
 }
 
@@ -158,7 +163,7 @@ pub fn own_fit(
             .min_by(|a, b| gap_to(a).norm_squared().total_cmp(&gap_to(b).norm_squared()).then(a.cmp(b)));
         if let Some(row) = nearest {
             let normal = target.normals.map_or_else(Vector3::zeros, |normals| normals[row as usize]);
-            sum += contact.closeness(target, Place::On(row), normal * normal.dot(&gap_to(&row)));
+            sum += contact.closeness(target, row, normal * normal.dot(&gap_to(&row)));
             count += 1;
         }
     }
@@ -166,12 +171,28 @@ pub fn own_fit(
 }
 
 impl Contact<'_> {
-    /// max(0, 1 - d / reach) of a point that lies `gap` from where `place` says; 0 elsewhere. d is the length of the
+    /// The row of the target that a moved source point with a moved normal touches, and the way to it from there: `row`,
+    /// the nearest, if that is near enough and its normal agrees.
+    fn gap(
+        &self,
+        target: &Surface<'_>,
+        row: u32,
+        moved: &Point3<f64>,
+        normal: Option<Vector3<f64>>,
+    ) -> Option<(u32, Vector3<f64>)> {
+        let gap = moved - target.points[row as usize];
+        let agree = |(n, normals): (Vector3<f64>, &[Vector3<f64>])| {
+            up_to_sign(n.dot(&normals[row as usize]), self.oriented) >= self.min_normal_cos
+        };
+        let touches = gap.norm() <= self.distance && normal.zip(target.normals).is_none_or(agree);
+        touches.then_some((row, gap))
+    }
+
+    /// max(0, 1 - d / reach) of a point that lies `gap` from a row of the target. d is the length of the
     /// gap and the reach the distance. Across the surface the reach is half of that, and d the part of the gap along the
     /// normal, as how far the points of a thinned scan lie apart says nothing; but what lies farther aside than a third
     /// of the distance lies beyond the end of the surface, and by so much farther.
-    fn closeness(&self, target: &Surface<'_>, place: Place, gap: Vector3<f64>) -> f64 {
-        let Place::On(row) = place else { return 0.0 };
+    fn closeness(&self, target: &Surface<'_>, row: u32, gap: Vector3<f64>) -> f64 {
         match target.normals {
             Some(normals) if self.to_planes => {
                 let across = normals[row as usize].dot(&gap).abs();
@@ -200,28 +221,24 @@ fn each_place(
     let sighted = contact.view.filter(|_| contact.oriented).zip(source.normals);
     let sighted =
         sighted.map(|(view, normals)| Sighted::new(view, normals, target_from_source, contact.distance));
+    let sight = |i: usize, moved: &Point3<f64>| {
+        sighted.as_ref().map_or(Sight::Open, |sighted| sighted.sight(i, &rotation, moved))
+    };
     let visible = rows.filter_map(|i| {
         let moved = rotation * source.points[i] + shift;
-        let sight = sighted.as_ref().map_or(Sight::Open, |sighted| sighted.sight(i, &rotation, &moved));
+        let sight = sight(i, &moved);
         (sight != Sight::Hidden).then_some(((i, sight), moved))
     });
-    let normals = source.normals.zip(target.normals);
-    nearby.nearest_each(contact.distance, visible, |(i, sight), moved, row| {
-        let gap = |row: u32| moved - target.points[row as usize];
-        let on = row.map(|row| (row, gap(row))).filter(|&(row, gap)| {
-            let agree = |(n, m): (&[Vector3<f64>], &[Vector3<f64>])| {
-                up_to_sign((rotation * n[i]).dot(&m[row as usize]), contact.oriented)
-                    >= contact.min_normal_cos
-            };
-            gap.norm() <= contact.distance && normals.is_none_or(agree)
-        });
-        match on {
+    let (keys, moved): (Vec<_>, Vec<_>) = visible.unzip();
+    let nearest = nearby.nearest_each(contact.distance, &moved);
+    for ((&(i, sight), moved), row) in keys.iter().zip(&moved).zip(nearest) {
+        match row.and_then(|row| contact.gap(target, row, moved, source.normals.map(|n| rotation * n[i]))) {
             Some((row, gap)) => found(i, Place::On(row), gap),
             // Where the surface ends the camera sees past it.
             None if sight == Sight::Through => found(i, Place::Through, Vector3::zeros()),
             None => found(i, Place::Free, Vector3::zeros()),
         }
-    });
+    }
 }
 
 /// The camera's view of the source in one pose.

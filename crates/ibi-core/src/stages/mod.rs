@@ -199,8 +199,9 @@ impl Context<'_> {
             explained.filter(agrees).count()
         };
         let claims = self.claims.near(target_from_source);
-        let fit =
-            self.scene.fit(self.params, detail, target_from_source, |row| exclusive && claims.contains(row));
+        let are_claimed =
+            |rows: &[u32]| if exclusive { claims.contain(rows) } else { vec![false; rows.len()] };
+        let fit = self.scene.fit(self.params, detail, target_from_source, are_claimed);
         Support {
             num_explained: (num_explained as u32 * step).max(num_agreeing as u32),
             num_agreeing: num_agreeing as u32,

@@ -99,12 +99,25 @@ impl Shape {
 
     /// How far a few points are off, on average and at most [`REACH`] each: to choose among many starts.
     pub(super) fn glance(&self, motion: &Isometry3<f64>) -> f64 {
-        let (mut sum, rotation) = (0.0, motion.rotation.to_rotation_matrix());
-        let moved = self.glance.iter().map(|p| ((), rotation * p + motion.translation.vector));
-        self.nearby.nearest_each(REACH, moved, |(), moved, row| {
-            sum += row.map_or(REACH, |row| (moved - self.points[row as usize]).norm());
-        });
-        sum / self.glance.len() as f64
+        let off = self.off(&self.glance, motion, |moved, row| (moved - self.points[row]).norm());
+        off.sum::<f64>() / self.glance.len() as f64
+    }
+
+    /// How far each of `points` is off once it is moved: `off(moved, row)` with the row of the nearest point, and
+    /// [`REACH`] where there is none.
+    fn off(
+        &self,
+        points: &[Point3<f64>],
+        motion: &Isometry3<f64>,
+        off: impl Fn(&Point3<f64>, usize) -> f64,
+    ) -> impl Iterator<Item = f64> {
+        let (rotation, shift) = (motion.rotation.to_rotation_matrix(), motion.translation.vector);
+        let moved: Vec<_> = points.iter().map(|p| rotation * p + shift).collect();
+        let nearest = self.nearby.nearest_each(REACH, &moved);
+        moved
+            .into_iter()
+            .zip(nearest)
+            .map(move |(moved, row)| row.map_or(REACH, |row| off(&moved, row as usize)))
     }
 
     /// The motion, moved to where the surface fits itself best.
@@ -131,15 +144,10 @@ impl Shape {
     pub(super) fn deviation(&self, motion: &Isometry3<f64>) -> f64 {
         let mut off: Vec<f64> = Vec::with_capacity(2 * self.judged.len());
         for motion in [*motion, motion.inverse()] {
-            let (rotation, shift) = (motion.rotation.to_rotation_matrix(), motion.translation.vector);
-            let moved = self.judged.iter().map(|p| ((), rotation * p + shift));
-            self.nearby.nearest_each(REACH, moved, |(), moved, row| {
-                off.push(row.map_or(REACH, |row| {
-                    let apart = moved - self.points[row as usize];
-                    let across = apart.dot(&self.normals[row as usize]).abs();
-                    across.max(apart.norm() - self.gap)
-                }));
-            });
+            off.extend(self.off(&self.judged, &motion, |moved, row| {
+                let apart = moved - self.points[row];
+                apart.dot(&self.normals[row]).abs().max(apart.norm() - self.gap)
+            }));
         }
         let at = ((off.len() as f64 * WITHIN) as usize).min(off.len() - 1);
         let (_, most, rest) = off.select_nth_unstable_by(at, f64::total_cmp);

@@ -39,9 +39,14 @@ impl Validate for Overlap {
         let mut places = context.scene.places(context.params, &hypothesis.target_from_source);
         let claims = context.claims.near(&hypothesis.target_from_source);
         if self.exclusive && !claims.is_empty() {
-            for place in &mut places {
-                if matches!(place, Place::On(row) if claims.contains(*row)) {
-                    *place = Place::Free;
+            let on = places.iter().enumerate().filter_map(|(i, place)| match place {
+                Place::On(row) => Some((i, *row)),
+                _ => None,
+            });
+            let (on, rows): (Vec<usize>, Vec<u32>) = on.unzip();
+            for (i, is_claimed) in on.into_iter().zip(claims.contain(&rows)) {
+                if is_claimed {
+                    places[i] = Place::Free;
                 }
             }
         }
