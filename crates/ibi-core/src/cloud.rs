@@ -157,7 +157,7 @@ impl<'a> PreparedCloud<'a> {
         }
         let spacing = mean_spacing(points);
         // A little more, for rounding.
-        let radius = (1.0 + 1e-12) * points.iter().map(|p| (p - centre).norm()).fold(0.0, f64::max);
+        let radius_sq = points.iter().map(|p| (p - centre).norm_squared()).fold(0.0, f64::max);
         Ok(Self {
             points: points.clone(),
             frames: cloud.frames.clone(),
@@ -166,7 +166,7 @@ impl<'a> PreparedCloud<'a> {
             spacing,
             extent,
             centre,
-            radius,
+            radius: (1.0 + 1e-12) * radius_sq.sqrt(),
             probe: Probe::new(points, unit_normals.as_deref(), PROBE_POINTS),
             scout: Probe::new(points, unit_normals.as_deref(), SCOUT_POINTS),
             normals: unit_normals,

@@ -10,7 +10,7 @@ use crate::cloud::{Cloud, PreparedCloud, check_points};
 use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
-use crate::joint::joint_check;
+use crate::joint::{joint_check, supports};
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
@@ -299,21 +299,32 @@ impl<'a> Registrar<'a> {
         let round = state.rounds.len();
         let context = problem.context(&self.params, round, found);
         let mut timings = Timings::default();
-        let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
-        // After a success the next one is likely, and playing ahead would be in vain.
+        let mut select = || timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
+        // The first selection builds the graph, and leaves a second thread idle in between.
+        let seeds = if round == 0 && self.scs.is_none() {
+            par::join(select, || context.chance()).0
+        } else {
+            select()
+        };
         let is_lean = state.rounds.last().is_some_and(|last| !last.accepted());
         if !is_lean || !self.plays_ahead() || seeds.len() < self.params.t_s as usize {
-            return self.play_seeds(&context, tried, seeds, timings);
+            let play = || self.play_seeds(&context, tried, is_lean, seeds, timings);
+            // After a success the next one is likely, and playing ahead would be in vain: an idle thread had better measure
+            // what was found.
+            return match found.last().filter(|_| !is_lean && par::is_parallel()) {
+                Some(found) => par::join(play, || found.overlap(&problem.scene, &self.params)).0,
+                None => play(),
+            };
         }
         context.chance(); // not from within the two threads
         let barred = problem.also_barred(seeds.ids());
         let (now, next) = par::join(
-            || self.play_seeds(&context, tried, seeds, timings),
+            || self.play_seeds(&context, tried, is_lean, seeds, timings),
             || {
                 let context = Context { barred: &barred, ..problem.context(&self.params, round + 1, found) };
                 let mut timings = Timings::default();
                 let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
-                self.play_seeds(&context, tried, seeds, timings)
+                self.play_seeds(&context, tried, true, seeds, timings)
             },
         );
         state.ahead = Some(next);
@@ -327,8 +338,15 @@ impl<'a> Registrar<'a> {
         par::is_parallel() && !has_own_stage && self.params.removal == Removal::Inliers
     }
 
-    /// CE -> TE -> HV.
-    fn play_seeds(&self, context: &Context<'_>, tried: &Tried, seeds: Ranked, mut timings: Timings) -> Play {
+    /// CE -> TE -> HV. `is_lean`: whether the round before came to nothing.
+    fn play_seeds(
+        &self,
+        context: &Context<'_>,
+        tried: &Tried,
+        is_lean: bool,
+        seeds: Ranked,
+        mut timings: Timings,
+    ) -> Play {
         if seeds.len() < self.params.t_s as usize || context.interrupt.is_set() {
             return Play { seeds, timings, ..Play::default() };
         }
@@ -336,7 +354,7 @@ impl<'a> Registrar<'a> {
         let estimate = timed(&mut timings.te_s, || self.te().estimate_pose(context, &dense));
         let judged = estimate.hypothesis.map(|raw| {
             let before = self.known(context.scene, tried, &raw, None);
-            before.unwrap_or_else(|| self.judge(context, tried, raw, &mut timings))
+            before.unwrap_or_else(|| self.judge(context, tried, is_lean, raw, &mut timings))
         });
         Play { seeds, dense, estimate, judged, timings }
     }
@@ -361,10 +379,17 @@ impl<'a> Registrar<'a> {
         same.or_else(|| rough.and_then(|rough| tried.next_to(rough, is_same)))
     }
 
-    /// Polishes a hypothesis and validates it. Before that comes a glance, at one that is polished roughly where it has few
-    /// inliers or the scene is seen from one side: neither is done to the end where it shows the hypothesis to be
-    /// hopeless, or to be known.
-    fn judge(&self, context: &Context<'_>, tried: &Tried, raw: Hypothesis, timings: &mut Timings) -> Judged {
+    /// Polishes a hypothesis and validates it. Neither is done to the end where a rough polish, of one that has few inliers
+    /// or where the scene is seen from one side, shows it to be known; or where a glance shows it to be hopeless, which is
+    /// not expected after a success.
+    fn judge(
+        &self,
+        context: &Context<'_>,
+        tried: &Tried,
+        is_lean: bool,
+        raw: Hypothesis,
+        timings: &mut Timings,
+    ) -> Judged {
         let Timings { refine_s, hv_s, .. } = timings;
         let scene = context.scene;
         let is_one_sided = scene.is_one_sided(context.params);
@@ -378,7 +403,7 @@ impl<'a> Registrar<'a> {
             return known;
         }
         let fitted = polished.filter(|_| !is_one_sided).map_or(glanced, |polished| polished.hypothesis);
-        if let Some(verdict) = timed(hv_s, || self.hv().glance(context, &fitted)) {
+        if is_lean && let Some(verdict) = timed(hv_s, || self.hv().glance(context, &fitted)) {
             return Judged { hypothesis: glanced, verdict, rough };
         }
         let hypothesis = timed(refine_s, || context.refined(Detail::Look, glanced)).unwrap_or(raw);
@@ -420,10 +445,13 @@ impl<'a> Registrar<'a> {
         let pool = Arc::clone(&state.pool);
         pool.install(|| {
             while self.settle(&mut state) > 0 {}
-            if self.params.joint_check {
-                joint_check(&state.problem, &self.params, self.hv(), &mut state.found);
-            }
-            state.into_registration(&self.params, stop_reason)
+            let State { problem, found, .. } = &mut state;
+            let supports = if self.params.joint_check {
+                joint_check(problem, &self.params, self.hv(), found)
+            } else {
+                supports(problem, &self.params, found)
+            };
+            state.into_registration(&self.params, stop_reason, &supports)
         })
     }
 

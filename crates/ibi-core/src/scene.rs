@@ -142,11 +142,16 @@ impl Scene<'_> {
         let (rotation, shift) = (back.rotation.to_rotation_matrix(), back.translation.vector);
         // Far points need no search.
         let (centre, radius) = (self.source.centre, self.source.radius + distance);
-        let near = points.into_iter().filter_map(|(key, point)| {
-            let moved = rotation * point + shift;
-            ((moved - centre).norm_squared() <= radius * radius).then_some((key, moved))
-        });
-        let (keys, moved): (Vec<K>, Vec<_>) = near.unzip();
+        let points = points.into_iter();
+        let num = points.size_hint().0;
+        let (mut keys, mut moved) = (Vec::with_capacity(num), Vec::with_capacity(num));
+        for (key, point) in points {
+            let point = rotation * point + shift;
+            if (point - centre).norm_squared() <= radius * radius {
+                keys.push(key);
+                moved.push(point);
+            }
+        }
         let nearest = self.near_source.nearest_each(distance, &moved);
         let found = keys.into_iter().zip(&moved).zip(nearest).filter_map(|((key, moved), row)| {
             let row = row?;

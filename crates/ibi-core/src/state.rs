@@ -9,7 +9,6 @@ use nalgebra::Isometry3;
 use crate::claims::Claims;
 use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
-use crate::joint::alone;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::overlap::overlap;
@@ -122,11 +121,17 @@ impl Tried {
 pub(crate) struct Found {
     pub(crate) hypothesis: Hypothesis,
     pub(crate) round: u32,
+    overlap: OnceLock<f64>,
 }
 
 impl Found {
     pub(crate) fn pose(&self) -> &Isometry3<f64> {
         &self.hypothesis.target_from_source
+    }
+
+    /// Share of the source that lies on the target; measured when first asked for.
+    pub(crate) fn overlap(&self, scene: &Scene<'_>, params: &Params) -> f64 {
+        *self.overlap.get_or_init(|| overlap(&scene.places(params, self.pose())))
     }
 }
 
@@ -425,24 +430,20 @@ impl<'a> State<'a> {
         }
         self.tried = Tried::default();
         self.ahead = None;
-        self.found.push(Found { hypothesis, round });
+        self.found.push(Found { hypothesis, round, overlap: OnceLock::new() });
         self.last_passed_at = self.rounds.len() as u32;
         Some(value)
     }
 
-    /// The result: poses measured and ranked, correspondences labelled.
-    pub(crate) fn into_registration(mut self, params: &Params, stop_reason: StopReason) -> Registration {
-        let everything = Alive::all(&self.problem.pairs);
-        let of_all = self.problem.context_of(params, 0, &everything, &self.found);
-        of_all.chance(); // not from within the map
+    /// The result: poses measured and ranked, correspondences labelled. `supports` tells what speaks for each instance.
+    pub(crate) fn into_registration(
+        mut self,
+        params: &Params,
+        stop_reason: StopReason,
+        supports: &[Support],
+    ) -> Registration {
         let mut measured: Vec<(Pose, Vec<f64>)> = par::map(self.found.len(), 1, |at| {
-            let found = &self.found[at];
-            let support = if params.joint_check {
-                alone(&of_all, at, found, |own| own.support(Detail::Look, found.pose(), true))
-            } else {
-                of_all.support(Detail::Look, found.pose(), false)
-            };
-            measure(&self.problem, params, found, &support)
+            measure(&self.problem, params, &self.found[at], &supports[at])
         });
         // Stable: equals stay in the order in which they were found.
         measured.sort_by(|(a, _), (b, _)| b.score.total_cmp(&a.score));
@@ -474,11 +475,10 @@ fn measure(problem: &Problem<'_>, params: &Params, found: &Found, support: &Supp
         .filter(|&(_, residual_sq)| residual_sq < t_he * t_he)
         .unzip();
     let mean_sq = residuals_sq.iter().sum::<f64>() / residuals_sq.len().max(1) as f64;
-    let overlap = overlap(&scene.places(params, &pose));
     let pose = Pose {
         target_from_source: pose,
         score: support.score(),
-        overlap,
+        overlap: found.overlap(scene, params),
         closeness: support.closeness(),
         back_fit: support.back_fit,
         evidence: support.evidence(),

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use nalgebra::{Isometry3, Point3};
 
-use super::columns::Columns;
+use super::columns::{Columns, min_max};
 use super::grid::Grid;
 use super::mae::residual_sq;
 
@@ -61,16 +61,16 @@ impl ByTarget {
     }
 
     /// Ids of the pairs whose target point lies within `radius` of `place`, both in the unit and frame of the target
-    /// points as they were given.
-    pub fn within(&self, place: &Point3<f64>, radius: f64) -> impl Iterator<Item = u32> + use<'_> {
+    /// points as they were given, in the order of the grid.
+    #[must_use]
+    pub fn within(&self, place: &Point3<f64>, radius: f64) -> Vec<u32> {
         let Columns { centres: (_, centre_q), unit, .. } = self.sorted;
         let place: [f32; 3] = ((place.coords - centre_q) / unit).cast().into();
         // A little more, for rounding.
         let radius = (radius / unit * (1.0 + 1e-6)) as f32;
-        let [x, y, z] = self.sorted.q.each_ref().map(Vec::as_slice);
-        self.around(place, radius).flatten().filter_map(move |at| {
-            let d = [x[at] - place[0], y[at] - place[1], z[at] - place[2]];
-            (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius * radius).then(|| self.id(at))
+        self.below(self.around(place, radius), radius * radius, true, move |_, q| {
+            let d = [q[0] - place[0], q[1] - place[1], q[2] - place[2]];
+            d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         })
     }
 
@@ -94,17 +94,32 @@ impl ByTarget {
     pub fn close_pairs(&self, target_from_source: &Isometry3<f64>, distance: f64) -> Vec<u32> {
         let residual_sq = residual_sq(&self.sorted, target_from_source);
         let distance_sq = (distance * distance) as f32;
+        self.below(self.near_pose(target_from_source, distance), distance_sq, false, residual_sq)
+    }
+
+    /// Ids of the pairs at the positions `runs` of which `f` is less than `bound`, or no more with `inclusive`.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // `f` must be seen through to vectorise
+    fn below(
+        &self,
+        runs: impl Iterator<Item = Range<usize>>,
+        bound: f32,
+        inclusive: bool,
+        f: impl Fn([f32; 3], [f32; 3]) -> f32 + Copy,
+    ) -> Vec<u32> {
         let mut buffer = [0.0_f32; CHUNK];
-        let mut close = Vec::new();
-        for run in self.near_pose(target_from_source, distance) {
+        let mut ids = Vec::with_capacity(CHUNK);
+        for run in runs {
             for start in run.clone().step_by(CHUNK) {
-                let residuals_sq = &mut buffer[..CHUNK.min(run.end - start)];
-                self.sorted.map_run_into(start..start + residuals_sq.len(), residuals_sq, residual_sq);
-                let hits = (start..).zip(&*residuals_sq).filter(|&(_, &r)| r < distance_sq);
-                close.extend(hits.map(|(at, _)| self.id(at)));
+                let values = &mut buffer[..CHUNK.min(run.end - start)];
+                self.sorted.map_run_into(start..start + values.len(), values, f);
+                let hits = (start..)
+                    .zip(&*values)
+                    .filter(|&(_, &value)| value < bound || inclusive && value == bound);
+                ids.extend(hits.map(|(at, _)| self.id(at)));
             }
         }
-        close
+        ids
     }
 }
 
@@ -114,8 +129,7 @@ pub(crate) fn ball(points: &[Vec<f32>; 3]) -> ([f32; 3], f32) {
         return ([0.0; 3], 0.0);
     }
     let middle = points.each_ref().map(|axis| {
-        let (low, high) =
-            axis.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), &x| (low.min(x), high.max(x)));
+        let (low, high) = min_max(axis);
         0.5 * (low + high)
     });
     let dist_sq = (0..points[0].len()).map(|i| {

@@ -161,6 +161,27 @@ pub(crate) fn dot(a: &[f32], b: &[f32]) -> f32 {
     lanes.iter().sum::<f32>()
 }
 
+/// The least and the greatest of finite values; the least is the greater if there are none.
+pub(crate) fn min_max(values: &[f32]) -> (f32, f32) {
+    simd(
+        #[inline(always)]
+        move || {
+            let (mut low, mut high) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES]);
+            let (chunks, rest) = values.as_chunks::<LANES>();
+            for values in chunks {
+                for k in 0..LANES {
+                    // Not `min`, which minds what is no number.
+                    low[k] = if values[k] < low[k] { values[k] } else { low[k] };
+                    high[k] = if values[k] > high[k] { values[k] } else { high[k] };
+                }
+            }
+            let low = low.iter().chain(rest).fold(f32::INFINITY, |low, &x| low.min(x));
+            let high = high.iter().chain(rest).fold(f32::NEG_INFINITY, |high, &x| high.max(x));
+            (low, high)
+        },
+    )
+}
+
 /// The middle of a cloud: of each coordinate the median of a sample. Stray points do not move it.
 pub(crate) fn middle(points: &[Point3<f64>]) -> Vector3<f64> {
     const SAMPLE: usize = 1000;

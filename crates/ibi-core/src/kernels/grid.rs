@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use super::columns::min_max;
 use super::simd::simd;
 
 /// Points sorted by cell, so that the points of a column of cells stand together.
@@ -162,7 +163,7 @@ impl Grid {
         let window = |c: usize, axis: usize| c.saturating_sub(most)..=(c + most).min(self.shape[axis] - 1);
         // Between two cells lie all those that separate them.
         let gap = |a: usize, b: usize| a.abs_diff(b).saturating_sub(1) as f32;
-        let mut runs = Vec::new();
+        let mut runs = Vec::with_capacity(window(x, 0).count() * window(y, 1).count());
         for other_x in window(x, 0) {
             for other_y in window(y, 1) {
                 let left = wide * wide - gap(x, other_x).powi(2) - gap(y, other_y).powi(2);
@@ -253,8 +254,7 @@ fn nearest_whole(x: f32, last: f32) -> usize {
 
 /// The interval that holds the bulk of the values.
 pub(crate) fn bulk(values: &[f32]) -> (f32, f32) {
-    let (least, most) =
-        values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(lo, hi), &x| (lo.min(x), hi.max(x)));
+    let (least, most) = min_max(values);
     if least > most {
         return (0.0, 0.0);
     }

@@ -100,7 +100,8 @@ pub fn fit(
     are_claimed: impl Fn(&[u32]) -> Vec<bool> + Sync,
 ) -> Fit {
     let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
-        let (mut visible, mut on, mut closeness) = (0_u32, Vec::new(), Vec::new());
+        let (mut on, mut closeness) = (Vec::with_capacity(rows.len()), Vec::with_capacity(rows.len()));
+        let mut visible = 0_u32;
         each_place(source, target, nearby, target_from_source, contact, rows, |_, place, gap| {
             visible += 1;
             if let Place::On(row) = place {
@@ -221,17 +222,17 @@ fn each_place(
     let sighted = contact.view.filter(|_| contact.oriented).zip(source.normals);
     let sighted =
         sighted.map(|(view, normals)| Sighted::new(view, normals, target_from_source, contact.distance));
-    let sight = |i: usize, moved: &Point3<f64>| {
-        sighted.as_ref().map_or(Sight::Open, |sighted| sighted.sight(i, &rotation, moved))
-    };
-    let visible = rows.filter_map(|i| {
-        let moved = rotation * source.points[i] + shift;
-        let sight = sight(i, &moved);
-        (sight != Sight::Hidden).then_some(((i, sight), moved))
-    });
-    let (keys, moved): (Vec<_>, Vec<_>) = visible.unzip();
+    let (mut visible, mut moved) = (Vec::with_capacity(rows.len()), Vec::with_capacity(rows.len()));
+    for i in rows {
+        let point = rotation * source.points[i] + shift;
+        let sight = sighted.as_ref().map_or(Sight::Open, |sighted| sighted.sight(i, &rotation, &point));
+        if sight != Sight::Hidden {
+            visible.push((i, sight));
+            moved.push(point);
+        }
+    }
     let nearest = nearby.nearest_each(contact.distance, &moved);
-    for ((&(i, sight), moved), row) in keys.iter().zip(&moved).zip(nearest) {
+    for ((&(i, sight), moved), row) in visible.iter().zip(&moved).zip(nearest) {
         match row.and_then(|row| contact.gap(target, row, moved, source.normals.map(|n| rotation * n[i]))) {
             Some((row, gap)) => found(i, Place::On(row), gap),
             // Where the surface ends the camera sees past it.

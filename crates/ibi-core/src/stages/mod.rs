@@ -59,6 +59,13 @@ pub trait Validate: Send + Sync {
         None
     }
 
+    /// The verdict that [`Self::validate`] would come to where [`Context::support`] of a close look, with claimed scene points
+    /// left out, is `support`. `None`, which is the default, if more must be known.
+    fn verdict_of(&self, support: &Support) -> Option<Verdict> {
+        let _ = support;
+        None
+    }
+
     /// Whether the verdict depends on nothing but the pose, what is alive and what is claimed. Then a hypothesis that ends
     /// up where another one was judged is not judged again. By default it may depend on more.
     fn is_repeatable(&self) -> bool {
@@ -116,9 +123,14 @@ impl Context<'_> {
     /// both points must agree as well.
     #[must_use]
     pub fn inliers(&self, target_from_source: &Isometry3<f64>, distance_pr: f64) -> Vec<u32> {
+        let mut inliers = self.unsorted_inliers(target_from_source, distance_pr);
+        inliers.sort_unstable();
+        inliers
+    }
+
+    fn unsorted_inliers(&self, target_from_source: &Isometry3<f64>, distance_pr: f64) -> Vec<u32> {
         let mut inliers = self.pairs.by_target.close_pairs(target_from_source, distance_pr);
         inliers.retain(|&id| self.alive.contains(id) && self.normals_agree(id, target_from_source));
-        inliers.sort_unstable();
         inliers
     }
 
@@ -135,7 +147,7 @@ impl Context<'_> {
     /// wrong, whose target point it explains.
     #[must_use]
     pub fn spent(&self, target_from_source: &Isometry3<f64>) -> Vec<u32> {
-        let mut spent = self.inliers(target_from_source, 2.0 * self.params.t_he_pr);
+        let mut spent = self.unsorted_inliers(target_from_source, 2.0 * self.params.t_he_pr);
         spent.extend(
             self.near(usize::MAX, self.params.d_op_pr, target_from_source)
                 .found
@@ -151,19 +163,15 @@ impl Context<'_> {
     /// nearest source point and the distance in data units. Of more than `most` around only every so many-th.
     fn near(&self, most: usize, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Near {
         let scene = self.scene;
-        let around = self.around(distance_pr, target_from_source);
-        let ids: Vec<u32> = around.filter(|&id| self.alive.contains(id)).collect();
+        let mut ids = self.around(distance_pr, target_from_source);
+        ids.retain(|&id| self.alive.contains(id));
         let step = ids.len().div_ceil(most).max(1);
         let targets = ids.iter().step_by(step).map(|&id| (id, self.pairs.target[id as usize]));
         Near { found: scene.nearest_source(distance_pr, target_from_source, targets), step: step as u32 }
     }
 
     /// Correspondences whose target point lies within `distance_pr` of the ball around the moved source.
-    pub(crate) fn around(
-        &self,
-        distance_pr: f64,
-        target_from_source: &Isometry3<f64>,
-    ) -> impl Iterator<Item = u32> + use<'_> {
+    pub(crate) fn around(&self, distance_pr: f64, target_from_source: &Isometry3<f64>) -> Vec<u32> {
         let source = self.scene.source;
         let radius = source.radius + self.length(distance_pr);
         self.pairs.by_target.within(&(target_from_source * source.centre), radius)
@@ -189,7 +197,7 @@ impl Context<'_> {
         let num_explained = explained.clone().count();
         let num_agreeing = if step > 1 {
             // The agreeing ones are found by themselves.
-            self.inliers(target_from_source, self.params.t_he_pr.min(self.params.d_op_pr)).len()
+            self.unsorted_inliers(target_from_source, self.params.t_he_pr.min(self.params.d_op_pr)).len()
         } else {
             let agrees = |&&(id, ..): &&(u32, u32, f64)| {
                 let (p, q) = (self.pairs.source[id as usize], self.pairs.target[id as usize]);
@@ -248,7 +256,7 @@ impl Context<'_> {
                 self.scene.icp(self.params, detail, &hypothesis.target_from_source)
             }
         };
-        let support = self.inliers(&target_from_source, self.params.t_he_pr).len();
+        let support = self.unsorted_inliers(&target_from_source, self.params.t_he_pr).len();
         let is_supported = support >= self.params.t_s as usize;
         Some(Polished { hypothesis: Hypothesis { target_from_source, ..hypothesis }, is_supported })
     }

@@ -44,38 +44,55 @@ impl Evidence {
 const GLANCE_MARGIN: f64 = 4.0;
 const GLANCE_MARGIN_ONE_SIDED: f64 = 2.0;
 
+/// The same for a look at 256 points: a closer polish brings no more.
+const LOOK_MARGIN: f64 = 3.0;
+
 /// A camera shows a quarter of a part, give or take.
 const USUALLY_EXPLAINED: f64 = 0.25;
 
 impl Evidence {
-    fn validate_at(
-        &self,
-        context: &Context<'_>,
-        detail: Detail,
-        hypothesis: &Hypothesis,
-    ) -> (Support, Verdict) {
-        let support = context.support(detail, &hypothesis.target_from_source, self.exclusive);
-        // Compared as log odds, in which the best of many sure poses still stands out.
-        let verdict = Verdict { value: support.log_odds(), threshold: log_odds(self.t_score) };
-        (support, verdict)
+    fn support(&self, context: &Context<'_>, detail: Detail, hypothesis: &Hypothesis) -> Support {
+        context.support(detail, &hypothesis.target_from_source, self.exclusive)
+    }
+
+    /// Compared as log odds, in which the best of many sure poses still stands out.
+    fn verdict(&self, support: &Support) -> Verdict {
+        Verdict { value: support.log_odds(), threshold: log_odds(self.t_score) }
+    }
+
+    /// One flat face fits in many places. Of two poses the one that explains more of the scene comes first.
+    fn ranked(&self, support: &Support) -> Verdict {
+        let verdict = self.verdict(support);
+        if !support.one_sided {
+            return verdict;
+        }
+        let Verdict { value, threshold } = verdict;
+        Verdict { value: threshold + (value - threshold) * support.explained / USUALLY_EXPLAINED, threshold }
     }
 }
 
 impl Validate for Evidence {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        let (support, verdict) = self.validate_at(context, Detail::Look, hypothesis);
-        if !support.one_sided {
-            return verdict;
-        }
-        // One flat face fits in many places. Of two poses the one that explains more of the scene comes first.
-        let Verdict { value, threshold } = verdict;
-        Verdict { value: threshold + (value - threshold) * support.explained / USUALLY_EXPLAINED, threshold }
+        self.ranked(&self.support(context, Detail::Look, hypothesis))
+    }
+
+    fn verdict_of(&self, support: &Support) -> Option<Verdict> {
+        self.exclusive.then(|| self.ranked(support))
     }
 
     fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
-        let (support, verdict) = self.validate_at(context, Detail::Glance, hypothesis);
-        let margin = if support.one_sided { GLANCE_MARGIN_ONE_SIDED } else { GLANCE_MARGIN };
-        (verdict.value < verdict.threshold - margin).then_some(verdict)
+        let falls_short = |detail: Detail| {
+            let support = self.support(context, detail, hypothesis);
+            let verdict = self.verdict(&support);
+            let margin = match detail {
+                Detail::Glance if support.one_sided => GLANCE_MARGIN_ONE_SIDED,
+                Detail::Glance => GLANCE_MARGIN,
+                Detail::Look if support.one_sided => f64::INFINITY,
+                Detail::Look => LOOK_MARGIN,
+            };
+            (verdict.value < verdict.threshold - margin).then_some(verdict)
+        };
+        falls_short(Detail::Glance).or_else(|| falls_short(Detail::Look))
     }
 
     fn is_sure(&self, verdict: &Verdict) -> bool {

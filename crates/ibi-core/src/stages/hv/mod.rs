@@ -11,6 +11,7 @@ pub use none::None;
 pub use overlap::Overlap;
 
 use super::{Context, Hypothesis, Validate, Verdict, variants};
+use crate::kernels::evidence::Support;
 
 variants! {
     /// The ways to validate a hypothesis.
@@ -43,6 +44,13 @@ impl Validate for Hv {
     fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
         match self {
             Self::Evidence(evidence) => evidence.glance(context, hypothesis),
+            _ => Option::None,
+        }
+    }
+
+    fn verdict_of(&self, support: &Support) -> Option<Verdict> {
+        match self {
+            Self::Evidence(evidence) => evidence.verdict_of(support),
             _ => Option::None,
         }
     }
