@@ -68,7 +68,7 @@ impl ByTarget {
         let place: [f32; 3] = ((place.coords - centre_q) / unit).cast().into();
         // A little more, for rounding.
         let radius = (radius / unit * (1.0 + 1e-6)) as f32;
-        self.below(self.around(place, radius), radius * radius, true, move |_, q| {
+        self.below(self.around(place, radius), (radius * radius).next_up(), move |_, q| {
             let d = [q[0] - place[0], q[1] - place[1], q[2] - place[2]];
             d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         })
@@ -94,17 +94,16 @@ impl ByTarget {
     pub fn close_pairs(&self, target_from_source: &Isometry3<f64>, distance: f64) -> Vec<u32> {
         let residual_sq = residual_sq(&self.sorted, target_from_source);
         let distance_sq = (distance * distance) as f32;
-        self.below(self.near_pose(target_from_source, distance), distance_sq, false, residual_sq)
+        self.below(self.near_pose(target_from_source, distance), distance_sq, residual_sq)
     }
 
-    /// Ids of the pairs at the positions `runs` of which `f` is less than `bound`, or no more with `inclusive`.
+    /// Ids of the pairs at the positions `runs` of which `f` is less than `bound`.
     #[inline(always)]
     #[allow(clippy::inline_always)] // `f` must be seen through to vectorise
     fn below(
         &self,
         runs: impl Iterator<Item = Range<usize>>,
         bound: f32,
-        inclusive: bool,
         f: impl Fn([f32; 3], [f32; 3]) -> f32 + Copy,
     ) -> Vec<u32> {
         let mut buffer = [0.0_f32; CHUNK];
@@ -113,9 +112,7 @@ impl ByTarget {
             for start in run.clone().step_by(CHUNK) {
                 let values = &mut buffer[..CHUNK.min(run.end - start)];
                 self.sorted.map_run_into(start..start + values.len(), values, f);
-                let hits = (start..)
-                    .zip(&*values)
-                    .filter(|&(_, &value)| value < bound || inclusive && value == bound);
+                let hits = (start..).zip(&*values).filter(|&(_, &value)| value < bound);
                 ids.extend(hits.map(|(at, _)| self.id(at)));
             }
         }
