@@ -141,17 +141,18 @@ impl PointPairs {
         for &row in &self.source_rows {
             uses[row as usize] += 1;
         }
-        let normals = source.normals.as_deref().zip(params.min_normal_cos);
-        let chance = |row: usize| {
-            let alike = |&other: &u32| {
-                normals.is_none_or(|(n, min_cos)| {
+        let near = if let Some((n, min_cos)) = source.normals.as_deref().zip(params.min_normal_cos) {
+            par::map(source.points.len(), 512, |row| {
+                let alike = |&other: &u32| {
                     up_to_sign(n[row].dot(&n[other as usize]), params.oriented_normals) >= min_cos
-                })
-            };
-            let near = scene.near_source.within(&source.points[row], t_he).filter(alike);
-            near.map(|other| uses[other as usize]).sum::<u32>() as f32 / self.len().max(1) as f32
+                };
+                let near = scene.near_source.within(&source.points[row], t_he).filter(alike);
+                near.map(|other| uses[other as usize]).sum::<u32>()
+            })
+        } else {
+            scene.near_source.sums_within(t_he, &source.points, &uses)
         };
-        par::map(source.points.len(), 512, chance)
+        near.into_iter().map(|num| num as f32 / self.len().max(1) as f32).collect()
     }
 
     /// M, the number of correspondences.

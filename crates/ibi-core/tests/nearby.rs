@@ -73,6 +73,12 @@ fn check_nearby(cloud: &[Point3<f64>], reach: f64, queries: &[Point3<f64>]) {
         }
     }
     assert_eq!(nearby.nearest_each(reach, queries), rows, "all at once as one by one");
+    let values: Vec<u32> = (1..=cloud.len() as u32).collect();
+    for distance in [0.0, 0.3 * reach, reach, 2.5 * reach] {
+        let sum = |query| nearby.within(query, distance).map(|row| values[row as usize]).sum::<u32>();
+        let sums: Vec<u32> = queries.iter().map(sum).collect();
+        assert_eq!(nearby.sums_within(distance, queries, &values), sums);
+    }
 }
 
 fn check_within(nearby: &Nearby, cloud: &[Point3<f64>], query: &Point3<f64>, distance: f64, doubt: f64) {

@@ -11,7 +11,7 @@ use super::columns::{columns, middle};
 use super::grid::{Grid, bulk};
 use super::par;
 use super::rng::Rng;
-use super::simd::{Simd, WithSimd, bytemuck, dispatch};
+use super::simd::{Simd, WithSimd, bytemuck, dispatch, simd};
 
 /// How many points are looked at side by side, at most.
 const LANES: usize = 16;
@@ -69,15 +69,52 @@ impl Nearby {
     /// Rows of the points within `distance` of `query`, up to rounding, in no particular order. The distance may exceed
     /// the reach.
     pub fn within(&self, query: &Point3<f64>, distance: f64) -> impl Iterator<Item = u32> + '_ {
-        let q = self.local(query);
-        // A little more, for rounding.
-        let radius = (distance / self.reach * (1.0 + 1e-6)) as f32;
+        let (q, radius) = (self.local(query), self.radius(distance));
         let Sorted { grid, points, .. } = &self.sorted;
         let [x, y, z] = points.each_ref().map(Vec::as_slice);
         grid.around(q, radius).flatten().filter_map(move |at| {
             let d = [x[at] - q[0], y[at] - q[1], z[at] - q[2]];
             (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius * radius).then(|| grid.order()[at])
         })
+    }
+
+    /// For each of `queries` the sum of the `values`, one for each row, of [`Self::within`].
+    #[must_use]
+    pub fn sums_within(&self, distance: f64, queries: &[Point3<f64>], values: &[u32]) -> Vec<u32> {
+        /// Queries that one thread takes at a time.
+        const GRAIN: usize = 512;
+        let radius = self.radius(distance);
+        let Sorted { grid, points, .. } = &self.sorted;
+        let values: Vec<u32> = grid.order().iter().map(|&row| values[row as usize]).collect();
+        let chunks = par::chunks(queries.len(), GRAIN, |run| {
+            let mut sums = vec![0; run.len()];
+            let (sums_mut, queries) = (&mut sums[..], &queries[run]);
+            simd(
+                #[inline(always)]
+                || {
+                    for (sum, query) in sums_mut.iter_mut().zip(queries) {
+                        let q = self.local(query);
+                        grid.each_around(
+                            q,
+                            radius,
+                            #[inline(always)]
+                            |run| {
+                                let [x, y, z] = points;
+                                let points = [&x[run.clone()], &y[run.clone()], &z[run.clone()]];
+                                *sum += sum_within(points, &values[run], q, radius * radius);
+                            },
+                        );
+                    }
+                },
+            );
+            sums
+        });
+        chunks.concat()
+    }
+
+    /// A distance in the unit of the columns, and a little more, for rounding.
+    fn radius(&self, distance: f64) -> f32 {
+        (distance / self.reach * (1.0 + 1e-6)) as f32
     }
 
     #[inline(always)]
@@ -114,6 +151,20 @@ impl Nearby {
         );
         search.row_within(f32::INFINITY)
     }
+}
+
+/// The sum of the values of the points within a radius of `place`.
+#[inline(always)]
+#[allow(clippy::inline_always)] // compiled for the vector units at hand
+fn sum_within([x, y, z]: [&[f32]; 3], values: &[u32], place: [f32; 3], radius_sq: f32) -> u32 {
+    let n = values.len();
+    let (x, y, z) = (&x[..n], &y[..n], &z[..n]);
+    let mut sum = 0;
+    for i in 0..n {
+        let d = [x[i] - place[0], y[i] - place[1], z[i] - place[2]];
+        sum += if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius_sq { values[i] } else { 0 };
+    }
+    sum
 }
 
 /// The loop of [`Nearby::nearest_each`].

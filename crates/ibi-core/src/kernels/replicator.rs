@@ -122,7 +122,7 @@ fn fitness(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
 /// Players of whom a matrix stays in the cache.
 const FEW: usize = 128;
 
-/// The same for few, as x^T Pi, since Pi is symmetric: a sum of rows needs no sum over lanes, and passes over the extinct.
+/// The same for few, as x^T Pi, since Pi is symmetric: a sum of rows needs no sum over lanes.
 fn fitness_of_few(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
     let (n, stride) = (*n, *stride);
     let mut fitness = vec![0.0; stride];
@@ -132,11 +132,10 @@ fn fitness_of_few(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32
         move || {
             for (block, sums) in blocks.iter_mut().enumerate() {
                 let mut lanes = [0.0; LANES];
-                for (row, &x) in values[block * LANES..].chunks(stride).zip(&x[..n]) {
-                    if x > 0.0 {
-                        for (lane, payoff) in lanes.iter_mut().zip(&row[..LANES]) {
-                            *lane += x * payoff;
-                        }
+                for (row, &x) in values.chunks_exact(stride).zip(&x[..n]) {
+                    let payoffs = row.as_chunks::<LANES>().0[block];
+                    for k in 0..LANES {
+                        lanes[k] += x * payoffs[k];
                     }
                 }
                 *sums = lanes;

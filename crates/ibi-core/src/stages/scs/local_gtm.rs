@@ -137,8 +137,9 @@ fn payoffs(graph: &Graph, players: &[u32]) -> Payoffs {
     let mut payoffs = Payoffs::zeros(players.len());
     // One column stands for all that do not play: whether a neighbour does is anybody's guess, and a store costs less
     // than a wrong guess.
-    let mut columns = vec![payoffs.padding() as u32; graph.len()];
-    for (column, &player) in (0_u32..).zip(players) {
+    const { assert!(MAX_OTHERS + 1 < u8::MAX as usize) };
+    let mut columns = vec![payoffs.padding() as u8; graph.len()];
+    for (column, &player) in (0_u8..).zip(players) {
         columns[player as usize] = column;
     }
     for (row, &i) in payoffs.padded_rows().zip(players) {
