@@ -488,7 +488,9 @@ class Model:
         if callback is not None and not callable(callback):
             raise TypeError(f"callback must be callable, not {type(callback).__name__}")
         overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
-        params = params.replace(**{name: value for name, value in overrides.items() if value is not None})
+        overrides = {name: value for name, value in overrides.items() if value is not None}
+        if overrides:
+            params = params.replace(**overrides)
 
         eye, measured = _camera(viewpoint)
         target, pairs, own = _points("tgt", tgt), _correspondences(corr), params._own()

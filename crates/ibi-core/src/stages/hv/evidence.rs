@@ -44,9 +44,6 @@ impl Evidence {
 const GLANCE_MARGIN: f64 = 4.0;
 const GLANCE_MARGIN_ONE_SIDED: f64 = 2.0;
 
-/// The same for a look at 256 points: a closer polish brings no more.
-const LOOK_MARGIN: f64 = 3.0;
-
 /// A camera shows a quarter of a part, give or take.
 const USUALLY_EXPLAINED: f64 = 0.25;
 
@@ -81,18 +78,10 @@ impl Validate for Evidence {
     }
 
     fn glance(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Option<Verdict> {
-        let falls_short = |detail: Detail| {
-            let support = self.support(context, detail, hypothesis);
-            let verdict = self.verdict(&support);
-            let margin = match detail {
-                Detail::Glance if support.one_sided => GLANCE_MARGIN_ONE_SIDED,
-                Detail::Glance => GLANCE_MARGIN,
-                Detail::Look if support.one_sided => f64::INFINITY,
-                Detail::Look => LOOK_MARGIN,
-            };
-            (verdict.value < verdict.threshold - margin).then_some(verdict)
-        };
-        falls_short(Detail::Glance).or_else(|| falls_short(Detail::Look))
+        let support = self.support(context, Detail::Glance, hypothesis);
+        let verdict = self.verdict(&support);
+        let margin = if support.one_sided { GLANCE_MARGIN_ONE_SIDED } else { GLANCE_MARGIN };
+        (verdict.value < verdict.threshold - margin).then_some(verdict)
     }
 
     fn is_sure(&self, verdict: &Verdict) -> bool {
