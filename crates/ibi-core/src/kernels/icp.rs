@@ -34,62 +34,32 @@ pub fn icp(
         let seen = Surface { points: &points, normals: normals.as_deref() };
         return icp(&seen, target, nearby, start, &Contact { view: None, ..*contact }, stop);
     }
-    match target.normals {
-        Some(normals) => to_planes(source, target, normals, nearby, start, contact, stop),
-        None => to_points(source, target, nearby, start, contact, stop),
-    }
-}
-
-/// Point-to-point. No step makes the cost greater, so it need not be measured.
-fn to_points(
-    source: &Surface<'_>,
-    target: &Surface<'_>,
-    nearby: &Nearby,
-    start: &Isometry3<f64>,
-    contact: &Contact<'_>,
-    stop: Stop,
-) -> Isometry3<f64> {
-    let mut pose = *start;
-    for _ in 0..stop.steps {
-        let places = places(source, target, nearby, &pose, contact);
-        let touching = on(&places).map(|(i, row)| (&source.points[i], &target.points[row]));
-        let Some(next) = rigid_fit(touching) else { break };
-        let has_come_to_rest = is_same(&pose, &next, source, stop.shift * contact.distance);
-        pose = next;
-        if has_come_to_rest {
-            break;
-        }
-    }
-    pose
-}
-
-/// Point-to-plane.
-fn to_planes(
-    source: &Surface<'_>,
-    target: &Surface<'_>,
-    normals: &[Vector3<f64>],
-    nearby: &Nearby,
-    start: &Isometry3<f64>,
-    contact: &Contact<'_>,
-    stop: Stop,
-) -> Isometry3<f64> {
     let (mut pose, mut best) = (*start, (f64::INFINITY, *start));
     let mut has_come_to_rest = false;
     for step in 0..=stop.steps {
-        let places = places(source, target, nearby, &pose, contact);
-        let cost = cost(source, target, normals, &pose, contact, &places);
-        if cost < best.0 {
-            best = (cost, pose);
-        }
-        if step == stop.steps || has_come_to_rest {
+        let is_last = step == stop.steps || has_come_to_rest;
+        // No step of point-to-point makes the cost greater: there it is not measured.
+        if is_last && target.normals.is_none() {
             break;
         }
-        let next = step_to_planes(source, target.points, normals, &pose, contact, &places);
+        let places = places(source, target, nearby, &pose, contact);
+        let next = if let Some(normals) = target.normals {
+            let cost = cost(source, target, normals, &pose, contact, &places);
+            if cost < best.0 {
+                best = (cost, pose);
+            }
+            if is_last {
+                break;
+            }
+            to_planes(source, target.points, normals, &pose, contact, &places)
+        } else {
+            rigid_fit(on(&places).map(|(i, row)| (&source.points[i], &target.points[row])))
+        };
         let Some(next) = next else { break };
         has_come_to_rest = is_same(&pose, &next, source, stop.shift * contact.distance);
         pose = next;
     }
-    best.1
+    if target.normals.is_some() { best.1 } else { pose }
 }
 
 /// When a refinement ends.
@@ -144,7 +114,7 @@ fn cost(
 }
 
 /// One damped Gauss-Newton step of the point-to-plane distances.
-fn step_to_planes(
+fn to_planes(
     source: &Surface<'_>,
     target: &[Point3<f64>],
     normals: &[Vector3<f64>],
