@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +30,8 @@ from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
 from ibi_rs.stages import Run
 from ibi_rs.symmetries import Symmetries, find_symmetries
+
+_DEFAULT = Params()
 
 
 def register(
@@ -482,7 +485,7 @@ class Model:
 
         Parameters, returns, raises: those of :func:`register`.
         """
-        params = params if params is not None else Params()
+        params = params if params is not None else _DEFAULT
         if not isinstance(params, Params):
             raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
         if callback is not None and not callable(callback):
@@ -500,7 +503,7 @@ class Model:
             self._source,
             target,
             pairs,
-            params._to_json(),
+            params._json,
             tgt_normals=None if tgt_normals is None else _points("tgt_normals", tgt_normals),
             tgt_frames=None if tgt_frames is None else _frames("tgt_frames", tgt_frames),
             similarity=None if similarity is None else _vector("similarity", similarity),
@@ -524,15 +527,11 @@ def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:
 
 
 def _registration(raw: dict[str, Any], params: Params) -> Registration:
-    numbers = ("score", "overlap", "closeness", "back_fit", "evidence", "inlier_rmse")
-    poses = []
-    for k, matrix in enumerate(raw["target_from_source"]):
-        measured = {name: float(raw[name][k]) for name in numbers}
-        poses.append(Pose(matrix, **measured, inliers=raw["inliers"][k], round=int(raw["round"][k])))
+    columns = [raw[field.name] for field in fields(Pose)]
     return Registration(
-        poses,
+        list(map(Pose, *columns)),
         labels=raw["labels"],
-        rounds=[Round._from_dict(data) for data in json.loads(raw["rounds"])],
+        rounds=raw["rounds"],
         stop_reason=StopReason(message=raw["stop_message"], **json.loads(raw["stop_reason"])),
         timings=Timings(**json.loads(raw["timings"])),
         resolution=raw["resolution"],

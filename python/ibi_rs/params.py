@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
@@ -146,7 +147,7 @@ class Params:
                 allowed = ", ".join([*(f"{variant.__name__}()" for variant in variants), "a callable"])
                 raise _core.ParamsError(f"params.{name} is {_shown(stage)}; it must be one of {allowed}")
         # numpy scalars become plain numbers here, so that equality, repr and pickles are those of plain data.
-        complete = json.loads(_core.check_params(self._to_json()))
+        complete = json.loads(_core.check_params(_dumps(self._built_in())))
         for name, value in _build(complete).items():
             if name in self._own():
                 continue
@@ -238,8 +239,9 @@ class Params:
             out[field.name] = value
         return out
 
-    def _to_json(self) -> str:
-        """Write all but the callables, in the place of which the core has its defaults."""
+    @cached_property
+    def _json(self) -> str:
+        """All but the callables, in the place of which the core has its defaults."""
         return _dumps(self._built_in())
 
 

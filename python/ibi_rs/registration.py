@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, overload
 
 import numpy as np
@@ -236,7 +238,7 @@ class Registration(Sequence[Pose]):
         poses: Sequence[Pose],
         *,
         labels: npt.NDArray[np.int32],
-        rounds: Sequence[Round],
+        rounds: str,
         stop_reason: StopReason,
         timings: Timings,
         resolution: float,
@@ -244,11 +246,16 @@ class Registration(Sequence[Pose]):
     ) -> None:
         self.poses = tuple(poses)
         self.labels = labels
-        self.rounds = tuple(rounds)
+        self._rounds = rounds  # JSON: few look at them, and reading them takes as long as the rest of this
         self.stop_reason = stop_reason
         self.timings = timings
         self.resolution = resolution
         self.params = params
+
+    @cached_property
+    def rounds(self) -> tuple[Round, ...]:
+        """One entry per round that was played to its end."""
+        return tuple(Round._from_dict(data) for data in json.loads(self._rounds))
 
     def canonical(self, symmetries: Symmetries, reference: npt.ArrayLike | None = None) -> Registration:
         """Return the same with each pose as :meth:`Pose.canonical` gives it."""

@@ -22,7 +22,7 @@ use ibi_core::kernels::mae::mae;
 use ibi_core::kernels::nearby::{Nearby, mean_spacing};
 use ibi_core::kernels::neighbors::Neighbors;
 use ibi_core::kernels::otsu::otsu;
-use ibi_core::kernels::overlap::{Contact, Surface, overlap, places};
+use ibi_core::kernels::overlap::{Contact, Surface, overlap};
 use ibi_core::kernels::replicator::{Payoffs, replicator};
 use ibi_core::kernels::triplets::TopTriplets;
 use ibi_core::nalgebra::{Point3, Vector3};
@@ -215,7 +215,7 @@ fn kernels(c: &mut Criterion) {
         let contact =
             Contact { distance: 0.15, min_normal_cos: 0.0, oriented: true, view: None, to_planes: false };
         let (model, whole) = (bare(&scene.source), bare(&scene.target));
-        let share = || overlap(&places(&model, &whole, &near, black_box(&pose), &contact));
+        let share = || overlap(&model, &whole, &near, black_box(&pose), &contact);
         let full = share();
         assert!(full > 0.999, "{full}");
         group.bench_function(BenchmarkId::new("overlap", scene.source.len()), |b| {

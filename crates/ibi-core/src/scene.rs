@@ -6,7 +6,7 @@ use crate::cloud::{PROBE_POINTS, PreparedCloud, SCOUT_POINTS};
 use crate::error::{Argument, Error};
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::Nearby;
-use crate::kernels::overlap::{Contact, Fit, Place, Surface, chance_fit, fit, own_fit, places};
+use crate::kernels::overlap::{Contact, Fit, Place, Surface, chance_fit, fit, overlap, own_fit, places};
 use crate::kernels::rng::Rng;
 use crate::kernels::sight::{RangeImage, View};
 use crate::params::Params;
@@ -94,6 +94,13 @@ impl Scene<'_> {
     pub fn places(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Vec<Place> {
         let (source, target, contact) = self.surfaces(params, params.d_op_pr);
         places(&source, &target, &self.near_target, target_from_source, &contact)
+    }
+
+    /// Share of the source points, of those that a camera can see, that lie on the target once the pose has moved them.
+    #[must_use]
+    pub fn overlap(&self, params: &Params, target_from_source: &Isometry3<f64>) -> f64 {
+        let (source, target, contact) = self.surfaces(params, params.d_op_pr);
+        overlap(&source, &target, &self.near_target, target_from_source, &contact)
     }
 
     /// The fit of the moved source to the target points that are not claimed, within a reach of 2 `d_op`.

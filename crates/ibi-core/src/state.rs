@@ -11,7 +11,6 @@ use crate::correspondence::{Alive, PointPairs};
 use crate::interrupt::Interrupt;
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
-use crate::kernels::overlap::overlap;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Refine, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
@@ -131,7 +130,7 @@ impl Found {
 
     /// Share of the source that lies on the target; measured when first asked for.
     pub(crate) fn overlap(&self, scene: &Scene<'_>, params: &Params) -> f64 {
-        *self.overlap.get_or_init(|| overlap(&scene.places(params, self.pose())))
+        *self.overlap.get_or_init(|| scene.overlap(params, self.pose()))
     }
 }
 

@@ -18,7 +18,7 @@ use ibi_core::kernels::mae::mae;
 use ibi_core::kernels::nearby::{Nearby, mean_spacing};
 use ibi_core::kernels::neighbors::Neighbors;
 use ibi_core::kernels::otsu::otsu;
-use ibi_core::kernels::overlap::{self, Contact, Surface, places};
+use ibi_core::kernels::overlap::{self, Contact, Surface, overlap_of, places};
 use ibi_core::kernels::par::{self, Pool};
 use ibi_core::kernels::replicator::{Payoffs, replicator};
 use ibi_core::kernels::rng::Rng;
@@ -538,7 +538,10 @@ fn overlap(source: &[Point3<f64>], target: &[Point3<f64>], pose: &Isometry3<f64>
     let bare = |points| Surface { points, normals: None };
     let contact =
         Contact { distance: d_op, min_normal_cos: 0.0, oriented: true, view: None, to_planes: false };
-    overlap::overlap(&places(&bare(source), &bare(target), &Nearby::new(target, d_op), pose, &contact))
+    let (source, target, near) = (bare(source), bare(target), Nearby::new(target, d_op));
+    let share = overlap::overlap(&source, &target, &near, pose, &contact);
+    assert_eq!(share, overlap_of(&places(&source, &target, &near, pose, &contact)));
+    share
 }
 
 fn check_neighbors(cloud: &[Point3<f64>], queries: impl IntoIterator<Item = Point3<f64>>) {

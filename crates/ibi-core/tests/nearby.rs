@@ -73,6 +73,11 @@ fn check_nearby(cloud: &[Point3<f64>], reach: f64, queries: &[Point3<f64>]) {
         }
     }
     assert_eq!(nearby.nearest_each(reach, queries), rows, "all at once as one by one");
+    for distance in [0.0, 0.3 * reach, reach] {
+        let nearest = nearby.nearest_each(distance, queries);
+        let is_some: Vec<bool> = nearest.iter().map(Option::is_some).collect();
+        assert_eq!(nearby.any_within_each(distance, queries), is_some);
+    }
     let values: Vec<u32> = (1..=cloud.len() as u32).collect();
     for distance in [0.0, 0.3 * reach, reach, 2.5 * reach] {
         let sum = |query| nearby.within(query, distance).map(|row| values[row as usize]).sum::<u32>();

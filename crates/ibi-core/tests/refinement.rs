@@ -9,7 +9,7 @@ mod oriented;
 use common::Mock;
 use ibi_core::kernels::icp::{Stop, icp};
 use ibi_core::kernels::nearby::Nearby;
-use ibi_core::kernels::overlap::{Contact, MIN_FACING_COS, Place, Surface, overlap, places};
+use ibi_core::kernels::overlap::{Contact, MIN_FACING_COS, Place, Surface, overlap, overlap_of, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::kernels::sight::View;
 use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -109,7 +109,9 @@ proptest! {
             let (hidden, on) = (count(|p| *p == Place::Hidden), count(|p| matches!(p, Place::On(_))));
             let visible = places.len() - hidden;
             let share = if visible == 0 { 0.0 } else { on as f64 / visible as f64 };
-            prop_assert_eq!(overlap(&places), share);
+            prop_assert_eq!(overlap_of(&places), share);
+            let surfaces = (source.surface(oriented), target.surface(oriented));
+            prop_assert_eq!(overlap(&surfaces.0, &surfaces.1, &near, &pose, &contact), share);
         }
     }
 }
@@ -128,14 +130,14 @@ fn points_that_face_away_are_hidden_and_count_in_no_overlap() {
     };
     let (above, below) = (Some(Point3::new(0.0, 0.0, 9.0)), Some(Point3::new(0.0, 0.0, -9.0)));
     assert_eq!(at(true, above), [Place::On(0), Place::Hidden, Place::Free]);
-    assert_eq!(overlap(&at(true, above)), 0.5);
+    assert_eq!(overlap_of(&at(true, above)), 0.5);
     assert_eq!(at(true, below), [Place::Hidden, Place::Free, Place::Hidden]);
-    assert_eq!(overlap(&at(true, below)), 0.0);
+    assert_eq!(overlap_of(&at(true, below)), 0.0);
     // Neither without a viewpoint nor without normals is anything known to be hidden.
     assert_eq!(at(true, None), [Place::On(0), Place::Free, Place::Free]);
     assert_eq!(at(false, above), at(true, None));
-    assert_eq!(overlap(&[Place::Hidden; 3]), 0.0);
-    assert_eq!(overlap(&[]), 0.0);
+    assert_eq!(overlap_of(&[Place::Hidden; 3]), 0.0);
+    assert_eq!(overlap_of(&[]), 0.0);
 }
 
 // -------------------------------------------------------------------------------------------------------- icp

@@ -4,7 +4,7 @@
 use std::f64::consts::PI;
 
 use ibi_core::kernels::nearby::Nearby;
-use ibi_core::kernels::overlap::{Contact, Place, Surface, fit, overlap, own_fit, places, visible};
+use ibi_core::kernels::overlap::{Contact, Place, Surface, fit, overlap_of, own_fit, places, visible};
 use ibi_core::kernels::rng::Rng;
 use ibi_core::kernels::sight::{OwnShadow, RangeImage, Sight, View};
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
@@ -176,7 +176,7 @@ fn a_pose_in_free_space_is_contradicted_and_one_behind_the_wall_is_hidden() {
     assert!(at(3.0).iter().all(|&place| place == Place::Through));
     assert!(at(5.0).iter().all(|&place| place == Place::Hidden));
     // What is contradicted counts, what is hidden does not.
-    assert_eq!((overlap(&at(4.0)), overlap(&at(3.0)), overlap(&at(5.0))), (1.0, 0.0, 0.0));
+    assert_eq!((overlap_of(&at(4.0)), overlap_of(&at(3.0)), overlap_of(&at(5.0))), (1.0, 0.0, 0.0));
     let rows = |z: f64, limit| {
         let (view, pose) = (scene.contact().view.unwrap(), Isometry3::translation(0.0, 0.0, z));
         visible(&scene.source(), &view, &pose, 0.1, limit)

@@ -242,33 +242,29 @@ pub(crate) fn rows3<T>(
     array: &PyReadonlyArray2<'_, f64>,
     row: impl Fn(f64, f64, f64) -> T,
 ) -> PyResult<Vec<T>> {
+    Ok(rows(array)?.iter().map(|&[x, y, z]| row(x, y, z)).collect())
+}
+
+/// The rows of a C-contiguous array.
+fn rows<'a, const N: usize, T: numpy::Element>(array: &'a PyReadonlyArray2<'_, T>) -> PyResult<&'a [[T; N]]> {
     let array = array.as_array();
-    if array.ncols() != 3 {
-        return Err(InputError::new_err(format!("expected 3 columns, got {}", array.ncols())));
+    if array.ncols() != N {
+        return Err(InputError::new_err(format!("expected {N} columns, got {}", array.ncols())));
     }
-    Ok(array.rows().into_iter().map(|r| row(r[0], r[1], r[2])).collect())
+    let values = array.to_slice().ok_or_else(|| InputError::new_err("expected a C-contiguous array"))?;
+    Ok(values.as_chunks().0)
 }
 
 /// (M, 2) int64 rows or (M, 6) float64 points.
 fn correspondences(corr: &Bound<'_, PyAny>) -> PyResult<Correspondences> {
-    if let Ok(rows) = corr.extract::<PyReadonlyArray2<'_, i64>>() {
-        let rows = rows.as_array();
-        if rows.ncols() != 2 {
-            return Err(InputError::new_err("corr of int64 must have 2 columns"));
-        }
+    if let Ok(ids) = corr.extract::<PyReadonlyArray2<'_, i64>>() {
         // A negative index wraps to one that is out of range; the core refuses it and reports it as it was.
         let wrap = |index: i64| usize::try_from(index).unwrap_or(index as usize);
-        return Ok(Correspondences::from_rows(
-            rows.rows().into_iter().map(|r| [wrap(r[0]), wrap(r[1])]).collect(),
-        ));
+        return Ok(Correspondences::from_rows(rows(&ids)?.iter().map(|row| row.map(wrap)).collect()));
     }
-    let points: PyReadonlyArray2<'_, f64> = corr.extract()?;
-    let points = points.as_array();
-    if points.ncols() != 6 {
-        return Err(InputError::new_err("corr of float64 must have 6 columns"));
-    }
-    let pair = |i: usize| [0, 3].map(|c| Point3::new(points[[i, c]], points[[i, c + 1]], points[[i, c + 2]]));
-    Ok(Correspondences::from_points((0..points.nrows()).map(pair).collect()))
+    let pairs: PyReadonlyArray2<'_, f64> = corr.extract()?;
+    let pair = |&[px, py, pz, qx, qy, qz]: &[f64; 6]| [Point3::new(px, py, pz), Point3::new(qx, qy, qz)];
+    Ok(Correspondences::from_points(rows(&pairs)?.iter().map(pair).collect()))
 }
 
 /// Arrays as arrays, the rest as JSON under "report".
@@ -280,7 +276,7 @@ fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyResult<Bound<
         matrix.iter().copied().collect::<Vec<f64>>()
     });
     let matrices: Bound<'py, PyArray3<f64>> = PyArray1::from_iter(py, rows).reshape([poses.len(), 4, 4])?;
-    let column = |f: fn(&ibi_core::Pose) -> f64| PyArray1::from_iter(py, poses.iter().map(f));
+    let column = |f: fn(&ibi_core::Pose) -> f64| poses.iter().map(f).collect::<Vec<f64>>();
     let inliers: Vec<_> =
         poses.iter().map(|p| PyArray1::from_iter(py, p.inliers.iter().map(|&id| i64::from(id)))).collect();
     let labels = registration.labels.iter().map(|label| label.map_or(-1, u32::cast_signed));
@@ -293,7 +289,7 @@ fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyResult<Bound<
     result.set_item("evidence", column(|p| p.evidence))?;
     result.set_item("inlier_rmse", column(|p| p.inlier_rmse))?;
     result.set_item("inliers", inliers)?;
-    result.set_item("round", PyArray1::from_iter(py, poses.iter().map(|p| i64::from(p.round))))?;
+    result.set_item("round", poses.iter().map(|p| p.round).collect::<Vec<u32>>())?;
     result.set_item("labels", PyArray1::from_iter(py, labels))?;
     result.set_item("rounds", json(&registration.rounds)?)?;
     result.set_item("stop_reason", json(&registration.stop_reason)?)?;

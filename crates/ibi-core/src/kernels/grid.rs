@@ -47,8 +47,12 @@ impl Grid {
     /// O(n) time; 4 bytes a point and at most 16 a point (or 16 KiB) for the cells.
     #[must_use]
     pub fn new(points: &[Vec<f32>; 3], cell: f32) -> Self {
+        Self::in_box(points, points.each_ref().map(|axis| bulk(axis)), cell)
+    }
+
+    /// The same where the [`bulk`] of each axis is known.
+    pub(crate) fn in_box(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
         let n = points[0].len();
-        let bounds = points.each_ref().map(|axis| bulk(axis));
         let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
         let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
         let mut cell = cell.max(widest / max_cells.min(MAX_PER_AXIS) as f32).max(MIN_CELL);

@@ -42,7 +42,7 @@ impl Nearby {
         let middle = middle(points);
         let rows = columns(points, middle, reach);
         // The reach is 1. A cell and its neighbours hold it, and the blocks of two cells an axis half of it for sure.
-        Self { sorted: Sorted::new(&rows, 1.005), middle, reach, inv_reach: 1.0 / reach }
+        Self { sorted: Sorted::new(&rows, Grid::new(&rows, 1.005)), middle, reach, inv_reach: 1.0 / reach }
     }
 
     /// The reach, in the unit of the points.
@@ -61,9 +61,14 @@ impl Nearby {
     /// reach. Within half the reach it is found in half the time.
     #[must_use]
     pub fn nearest_each(&self, distance: f64, queries: &[Point3<f64>]) -> Vec<Option<u32>> {
-        // A little more, for rounding.
-        let bound = (distance * self.inv_reach * (1.0 + 1e-6)) as f32;
-        dispatch(NearestEach { nearby: self, bound, queries })
+        dispatch(NearestEach { nearby: self, bound: self.radius(distance), queries })
+    }
+
+    /// Whether any point lies within `distance` of each of `queries`, up to rounding; it is at most the reach. A third of the
+    /// time of [`Self::nearest_each`].
+    #[must_use]
+    pub fn any_within_each(&self, distance: f64, queries: &[Point3<f64>]) -> Vec<bool> {
+        dispatch(AnyWithinEach { nearby: self, bound: self.radius(distance), queries })
     }
 
     /// Rows of the points within `distance` of `query`, up to rounding, in no particular order. The distance may exceed
@@ -114,7 +119,7 @@ impl Nearby {
 
     /// A distance in the unit of the columns, and a little more, for rounding.
     fn radius(&self, distance: f64) -> f32 {
-        (distance / self.reach * (1.0 + 1e-6)) as f32
+        (distance * self.inv_reach * (1.0 + 1e-6)) as f32
     }
 
     #[inline(always)]
@@ -150,6 +155,42 @@ impl Nearby {
             |run| search.look::<false>(run, NONE),
         );
         search.row_within(f32::INFINITY)
+    }
+}
+
+/// The loop of [`Nearby::any_within_each`].
+struct AnyWithinEach<'a> {
+    nearby: &'a Nearby,
+    bound: f32,
+    queries: &'a [Point3<f64>],
+}
+
+impl WithSimd for AnyWithinEach<'_> {
+    type Output = Vec<bool>;
+
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
+    fn with_simd<S: Simd>(self, simd: S) -> Self::Output {
+        let Self { nearby, bound, queries } = self;
+        let grid = &nearby.sorted.grid;
+        let columns = nearby.sorted.columns();
+        let mut any = Vec::with_capacity(queries.len());
+        for query in queries {
+            let q = nearby.local(query);
+            let mut search = Search::new(simd, columns, q, bound * bound);
+            for run in grid.block(q) {
+                search.look::<false>(run, NONE);
+            }
+            if bound > columns.seen && !search.has_found(bound) {
+                grid.each_of_wide_block(
+                    q,
+                    #[inline(always)]
+                    |run| search.look::<false>(run, NONE),
+                );
+            }
+            any.push(search.has_found(bound));
+        }
+        any
     }
 }
 
@@ -206,18 +247,16 @@ pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
     let rows = columns(points, middle, unit);
     // About as many cells as points fill a volume. Most clouds are surfaces: then cells are crowded, and a few
     // questions tell how much finer they should be.
-    let widest = rows
-        .each_ref()
-        .map(|axis| bulk(axis))
-        .iter()
-        .fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
-    let coarse = Sorted::new(&rows, widest / (n as f32 / POINTS_PER_CELL).cbrt());
+    let bounds = rows.each_ref().map(|axis| bulk(axis));
+    let widest = bounds.iter().fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
+    let sorted = |cell| Sorted::new(&rows, Grid::in_box(&rows, bounds, cell));
+    let coarse = sorted(widest / (n as f32 / POINTS_PER_CELL).cbrt());
     let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE));
     guess.sort_unstable_by(f64::total_cmp);
     // The median: a few far points must not make the cells of all others wide.
     let cell = CELL_PER_SPACING * (guess[guess.len() / 2] / unit) as f32;
     let spacings = if cell < 0.7 * coarse.grid.cell_size() {
-        let fine = Sorted::new(&rows, cell);
+        let fine = sorted(cell);
         fine.spacings(Some(&coarse), points, &fine.strata(SPACING_SAMPLE))
     } else {
         coarse.spacings(None, points, &coarse.strata(SPACING_SAMPLE))
@@ -248,8 +287,7 @@ struct Sorted {
 }
 
 impl Sorted {
-    fn new(rows: &[Vec<f32>; 3], cell: f32) -> Self {
-        let grid = Grid::new(rows, cell);
+    fn new(rows: &[Vec<f32>; 3], grid: Grid) -> Self {
         let points = rows.each_ref().map(|axis| {
             let sorted = grid.order().iter().map(|&i| axis[i as usize]);
             sorted.chain([f32::INFINITY; LANES]).collect()
@@ -303,17 +341,16 @@ impl Sorted {
         for run in self.grid.block(place) {
             search.look::<true>(run, row);
         }
-        search.row_within(columns.seen).or_else(
+        let other = search.row_within(columns.seen);
+        if other.is_some() {
+            return other;
+        }
+        self.grid.each_of_wide_block(
+            place,
             #[inline(always)]
-            || {
-                self.grid.each_of_wide_block(
-                    place,
-                    #[inline(always)]
-                    |run| search.look::<true>(run, row),
-                );
-                search.row_within(2.0 * columns.seen)
-            },
-        )
+            |run| search.look::<true>(run, row),
+        );
+        search.row_within(2.0 * columns.seen)
     }
 
     /// The row of the point nearest to that at `place`, which is itself `row`, of two or more.
@@ -350,17 +387,18 @@ impl WithSimd for Spacings<'_> {
     #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
     fn with_simd<S: Simd>(self, simd: S) -> Vec<f64> {
         let sorted = self.sorted;
-        let columns = sorted.columns();
-        let spacing = |&at: &u32| {
+        let (columns, coarser) = (sorted.columns(), self.coarser.unwrap_or(sorted));
+        let mut spacings = Vec::with_capacity(self.positions.len());
+        for &at in self.positions {
             let row = sorted.rows[at as usize];
             let place = sorted.points.each_ref().map(|axis| axis[at as usize]);
             let other = match sorted.near_other(simd, columns, place, row) {
                 Some(other) => other,
-                None => self.coarser.unwrap_or(sorted).nearest_other(simd, place, row),
+                None => coarser.nearest_other(simd, place, row),
             };
-            (self.rows[row as usize] - self.rows[other as usize]).norm()
-        };
-        self.positions.iter().map(spacing).collect()
+            spacings.push((self.rows[row as usize] - self.rows[other as usize]).norm());
+        }
+        spacings
     }
 }
 
@@ -407,26 +445,35 @@ impl<'a, S: Simd> Search<'a, S> {
         let mut start = run.start;
         // Once in any case: most runs are short, and then no branch has to be guessed.
         loop {
-            let lanes = start..start + S::F32_LANES;
-            let gap_sq = |axis: usize| {
-                let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
-                let gap = simd.sub_f32s(x, self.place[axis]);
-                simd.mul_f32s(gap, gap)
-            };
-            let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
-            let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
-            let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
-            if SKIP {
-                let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
-                nearer = simd.and_m32s(nearer, other);
+            for _ in 0..LANES / S::F32_LANES {
+                let lanes = start..start + S::F32_LANES;
+                let gap_sq = |axis: usize| {
+                    let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
+                    let gap = simd.sub_f32s(x, self.place[axis]);
+                    simd.mul_f32s(gap, gap)
+                };
+                let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
+                let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
+                let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
+                if SKIP {
+                    let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
+                    nearer = simd.and_m32s(nearer, other);
+                }
+                self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
+                self.row = simd.select_u32s(nearer, row, self.row);
+                start += S::F32_LANES;
             }
-            self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
-            self.row = simd.select_u32s(nearer, row, self.row);
-            start += S::F32_LANES;
             if start >= run.end {
                 return;
             }
         }
+    }
+
+    /// Whether a point nearer than the bound that the search began with was found.
+    #[inline(always)]
+    #[allow(clippy::inline_always)]
+    fn has_found(&self, bound: f32) -> bool {
+        self.simd.reduce_min_f32s(self.dist_sq) < bound * bound
     }
 
     /// The row of the nearest of all lanes, if that is within `distance`.

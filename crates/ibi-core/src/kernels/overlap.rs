@@ -301,8 +301,32 @@ pub fn visible(
 }
 
 /// Share of the visible source points that lie on the target; 0 if none is visible.
+///
+/// # Complexity
+/// As [`places`], of which it takes a part of the time where no normals count.
 #[must_use]
-pub fn overlap(places: &[Place]) -> f64 {
+pub fn overlap(
+    source: &Surface<'_>,
+    target: &Surface<'_>,
+    nearby: &Nearby,
+    target_from_source: &Isometry3<f64>,
+    contact: &Contact<'_>,
+) -> f64 {
+    if source.normals.is_some() {
+        return overlap_of(&places(source, target, nearby, target_from_source, contact));
+    }
+    let rotation = target_from_source.rotation.to_rotation_matrix();
+    let shift = target_from_source.translation.vector;
+    let chunks = par::chunks(source.points.len(), GRAIN, |rows| {
+        let moved: Vec<_> = source.points[rows].iter().map(|p| rotation * p + shift).collect();
+        nearby.any_within_each(contact.distance, &moved).into_iter().filter(|&is_on| is_on).count()
+    });
+    chunks.iter().sum::<usize>() as f64 / source.points.len().max(1) as f64
+}
+
+/// Share of the visible ones of `places` that are on the target; 0 if none is visible.
+#[must_use]
+pub fn overlap_of(places: &[Place]) -> f64 {
     let visible = places.iter().filter(|&&place| place != Place::Hidden).count();
     let on = places.iter().filter(|place| matches!(place, Place::On(_))).count();
     on as f64 / visible.max(1) as f64

@@ -1,5 +1,5 @@
 use crate::error::Error;
-use crate::kernels::overlap::{Place, overlap};
+use crate::kernels::overlap::{Place, overlap_of};
 use crate::params::share;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
@@ -36,9 +36,11 @@ impl Overlap {
 
 impl Validate for Overlap {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        let mut places = context.scene.places(context.params, &hypothesis.target_from_source);
-        let claims = context.claims.near(&hypothesis.target_from_source);
-        if self.exclusive && !claims.is_empty() {
+        let Context { scene, params, .. } = context;
+        let pose = &hypothesis.target_from_source;
+        let claims = context.claims.near(pose);
+        let value = if self.exclusive && !claims.is_empty() {
+            let mut places = scene.places(params, pose);
             let on = places.iter().enumerate().filter_map(|(i, place)| match place {
                 Place::On(row) => Some((i, *row)),
                 _ => None,
@@ -49,7 +51,10 @@ impl Validate for Overlap {
                     places[i] = Place::Free;
                 }
             }
-        }
-        Verdict { value: overlap(&places), threshold: self.t_overlap }
+            overlap_of(&places)
+        } else {
+            scene.overlap(params, pose)
+        };
+        Verdict { value, threshold: self.t_overlap }
     }
 }
