@@ -197,8 +197,8 @@ class Timings:
     prepare_s : float
         Checking the input, grids, resolution.
     scs_s, ce_s, te_s, refine_s, hv_s : float
-        The four stages and the refinement between the last two, all rounds. Where two rounds are played at
-        the same time, they count the seconds of both.
+        The four stages and the refinement between the last two, all rounds. Where the seeds of a round are
+        selected while the one before it is played, they count the seconds of both.
     total_s : float
         From the beginning of the run to its result.
     """

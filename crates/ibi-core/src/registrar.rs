@@ -11,6 +11,7 @@ use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
 use crate::interrupt::{CancelToken, Interrupt};
 use crate::joint::{joint_check, supports};
+use crate::kernels::graph::Graph;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
@@ -258,16 +259,7 @@ impl<'a> Registrar<'a> {
 
     fn round(&self, state: &mut State<'_>) -> ControlFlow<StopReason, Round> {
         state.check_limits(&self.params)?;
-        let mut play = match state.ahead.take() {
-            Some(play) => play,
-            None => self.play(state),
-        };
-        // Of two rounds played at the same time the later did not know of the earlier.
-        if let (Some(raw), Some(judged)) = (&play.estimate.hypothesis, &play.judged)
-            && let Some(known) = self.known(&state.problem.scene, &state.tried, raw, judged.rough.as_ref())
-        {
-            play.judged = Some(known);
-        }
+        let play = self.play(state);
         state.problem.interrupt.check()?;
         state.timings.add(&play.timings);
         if play.seeds.len() < self.params.t_s as usize {
@@ -292,24 +284,24 @@ impl<'a> Registrar<'a> {
         state.last_round()
     }
 
-    /// What the stages make of the next round. Where a second thread is idle it plays the round after it at the same
-    /// time, as it will be if this one comes to nothing: most do, and else it is played again.
+    /// What the stages make of the next round. Where a second thread is idle it selects the seeds of the round after it at
+    /// the same time, as they will be if this one comes to nothing: most do, and else they are selected again.
     fn play(&self, state: &mut State<'_>) -> Play {
+        let ahead = state.ahead.take();
         let State { problem, tried, found, .. } = &*state;
         let round = state.rounds.len();
         let context = problem.context(&self.params, round, found);
-        let mut timings = Timings::default();
-        let mut select = || timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
-        // The first selection builds the graph, and leaves a second thread idle in between.
-        let seeds = if round == 0 && self.scs.is_none() {
-            par::join(select, || context.chance()).0
-        } else {
-            select()
+        let select = || self.select(&context);
+        let (seeds, timings) = match ahead {
+            Some(selected) => selected,
+            // The first selection builds the graph, and leaves a second thread idle in between.
+            None if round == 0 && self.scs.is_none() => par::join(select, || context.chance()).0,
+            None => select(),
         };
         let is_lean = state.rounds.last().is_some_and(|last| !last.accepted());
-        if !is_lean || !self.plays_ahead() || seeds.len() < self.params.t_s as usize {
+        if !is_lean || !self.selects_ahead(problem) || seeds.len() < self.params.t_s as usize {
             let play = || self.play_seeds(&context, tried, is_lean, seeds, timings);
-            // After a success the next one is likely, and playing ahead would be in vain: an idle thread had better measure
+            // After a success the next one is likely, and selecting ahead would be in vain: an idle thread had better measure
             // what was found.
             return match found.last().filter(|_| !is_lean && par::is_parallel()) {
                 Some(found) => par::join(play, || found.overlap(&problem.scene, &self.params)).0,
@@ -318,24 +310,27 @@ impl<'a> Registrar<'a> {
         }
         context.chance(); // not from within the two threads
         let barred = problem.also_barred(seeds.ids());
-        let (now, next) = par::join(
+        let (play, next) = par::join(
             || self.play_seeds(&context, tried, is_lean, seeds, timings),
-            || {
-                let context = Context { barred: &barred, ..problem.context(&self.params, round + 1, found) };
-                let mut timings = Timings::default();
-                let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(&context));
-                self.play_seeds(&context, tried, true, seeds, timings)
-            },
+            || self.select(&Context { barred: &barred, ..problem.context(&self.params, round + 1, found) }),
         );
         state.ahead = Some(next);
-        now
+        play
     }
 
-    /// Whether a round may be played before the one before it is concluded. Not with stages of the user's, which may
-    /// count their rounds; nor if a round removes correspondences whatever comes of it.
-    fn plays_ahead(&self) -> bool {
+    fn select(&self, context: &Context<'_>) -> (Ranked, Timings) {
+        let mut timings = Timings::default();
+        let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(context));
+        (seeds, timings)
+    }
+
+    /// Whether the seeds of a round may be selected before the one before it is concluded. Not with stages of the user's,
+    /// which may count their rounds; nor if a round removes correspondences whatever comes of it; nor at a first look, which
+    /// the number of neighbourhoods that come to nothing brings to its end.
+    fn selects_ahead(&self, problem: &Problem<'_>) -> bool {
         let has_own_stage = self.scs.is_some() || self.ce.is_some() || self.te.is_some() || self.hv.is_some();
-        par::is_parallel() && !has_own_stage && self.params.removal == Removal::Inliers
+        let is_sample = problem.graph.get().is_some_and(Graph::is_sample);
+        par::is_parallel() && !has_own_stage && self.params.removal == Removal::Inliers && !is_sample
     }
 
     /// CE -> TE -> HV. `is_lean`: whether the round before came to nothing.
@@ -404,7 +399,7 @@ impl<'a> Registrar<'a> {
         }
         let fitted = polished.filter(|_| !is_one_sided).map_or(glanced, |polished| polished.hypothesis);
         if is_lean && let Some(verdict) = timed(hv_s, || self.hv().glance(context, &fitted)) {
-            return Judged { hypothesis: glanced, verdict, rough };
+            return Judged { hypothesis: glanced, verdict };
         }
         let hypothesis = timed(refine_s, || context.refined(Detail::Look, glanced)).unwrap_or(raw);
         let verdict = timed(hv_s, || self.hv().validate(context, &hypothesis));
@@ -413,10 +408,10 @@ impl<'a> Registrar<'a> {
         if verdict.accepted() && shift > NEGLIGIBLE_PR * scene.resolution {
             let before = timed(hv_s, || self.hv().validate(context, &raw));
             if before.value > verdict.value {
-                return Judged { hypothesis: raw, verdict: before, rough };
+                return Judged { hypothesis: raw, verdict: before };
             }
         }
-        Judged { hypothesis, verdict, rough }
+        Judged { hypothesis, verdict }
     }
 
     /// Ends a contest: of the hypotheses that passed validation, the one with the best value becomes an

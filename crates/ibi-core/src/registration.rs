@@ -179,7 +179,8 @@ impl std::fmt::Display for StopReason {
     }
 }
 
-/// Seconds of wall time. Where two rounds are played at the same time, the stages count the seconds of both.
+/// Seconds of wall time. Where the seeds of a round are selected while the one before it is played, the stages count the
+/// seconds of both.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 #[non_exhaustive]

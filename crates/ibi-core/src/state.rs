@@ -32,8 +32,9 @@ pub struct State<'a> {
     pub(crate) pool: Arc<Pool>,
     pub(crate) rounds_since_settling: u32,
     pub(crate) tried: Tried,
-    /// The next round, played beforehand; nothing has changed since but what a round that comes to nothing changes.
-    pub(crate) ahead: Option<Play>,
+    /// The seeds of the next round, selected beforehand; nothing has changed since but what a round that comes to nothing
+    /// changes.
+    pub(crate) ahead: Option<(Ranked, Timings)>,
     candidates: Vec<Candidate>,
     pub(crate) found: Vec<Found>,
     /// Rounds that had been played when a hypothesis last passed validation, or an instance was last found.
@@ -81,8 +82,6 @@ pub(crate) struct Judged {
     /// As it was judged, polished or not.
     pub(crate) hypothesis: Hypothesis,
     pub(crate) verdict: Verdict,
-    /// The pose at a first glance, unless that was worth nothing.
-    pub(crate) rough: Option<Isometry3<f64>>,
 }
 
 /// The estimated poses since an instance was last found, and what became of each.
@@ -101,11 +100,8 @@ impl Tried {
         rough: &Isometry3<f64>,
         is_same: impl Fn(&Isometry3<f64>, &Isometry3<f64>) -> bool,
     ) -> Option<Judged> {
-        self.0
-            .iter()
-            .map(|&(_, judged)| judged)
-            .find(|judged| is_same(rough, &judged.hypothesis.target_from_source))
-            .map(|judged| Judged { rough: Some(*rough), ..judged })
+        let mut judged = self.0.iter().map(|&(_, judged)| judged);
+        judged.find(|judged| is_same(rough, &judged.hypothesis.target_from_source))
     }
 
     fn add(&mut self, pose: &Isometry3<f64>, judged: Judged) {

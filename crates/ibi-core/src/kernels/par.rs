@@ -1,16 +1,20 @@
 //! Parallel maps. The only file that names `rayon`.
 //!
 //! A map runs in parallel inside a [`Pool`] and serially outside one. rayon's global pool is never touched: a
-//! process that forks after using it (Python's `multiprocessing` on Linux) hangs on the next use. Results are
-//! collected in order, so the number of threads never changes them.
+//! process that forks after using it (Python's `multiprocessing` on Linux) hangs on the next use, where a pool of ours
+//! sees that it has come into another process. Results are collected in order, so the number of threads never changes them.
 
 use crate::Error;
 
 /// A thread pool of our own, or, for one thread, none at all.
+///
+/// Its threads outlive it: the next pool of as many takes them over. New ones would cost a tenth of a millisecond, and
+/// start on the processor that starts them; until the system spreads them out, which takes it longer than a scene takes
+/// us, a second thread is of little use.
 #[derive(Debug)]
 pub struct Pool {
     #[cfg(feature = "rayon")]
-    pool: Option<rayon::ThreadPool>,
+    threads: Option<idle::Threads>,
 }
 
 impl Pool {
@@ -24,11 +28,8 @@ impl Pool {
             .or_else(|| std::thread::available_parallelism().ok().map(Into::into))
             .unwrap_or(1)
             .max(1);
-        let pool = (n > 1)
-            .then(|| rayon::ThreadPoolBuilder::new().num_threads(n).build())
-            .transpose()
-            .map_err(|e| Error::ThreadPool { reason: e.to_string() })?;
-        Ok(Self { pool })
+        let threads = (n > 1).then(|| idle::take(n).map_or_else(|| idle::Threads::new(n), Ok)).transpose();
+        Ok(Self { threads: threads.map_err(|e| Error::ThreadPool { reason: e.to_string() })? })
     }
 
     /// Without the feature `rayon` everything runs on the calling thread.
@@ -43,10 +44,69 @@ impl Pool {
     /// Runs `job`; the maps in it use this pool.
     pub fn install<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
         #[cfg(feature = "rayon")]
-        if let Some(pool) = &self.pool {
-            return pool.install(job);
+        if let Some(threads) = &self.threads {
+            return threads.pool.install(job);
         }
         job()
+    }
+}
+
+#[cfg(feature = "rayon")]
+impl Drop for Pool {
+    fn drop(&mut self) {
+        if let Some(threads) = self.threads.take() {
+            idle::put(threads);
+        }
+    }
+}
+
+/// Threads that nobody uses at the moment. A pool is used by one at a time: a thread that waits takes up other work of its
+/// pool, which must not be that of somebody else.
+#[cfg(feature = "rayon")]
+mod idle {
+    use std::sync::Mutex;
+    use std::{mem, process};
+
+    use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
+
+    /// So many pools are kept: as many as are used at the same time, as a rule.
+    const MOST: usize = 4;
+
+    static IDLE: Mutex<Vec<Threads>> = Mutex::new(Vec::new());
+
+    #[derive(Debug)]
+    pub(super) struct Threads {
+        pub(super) pool: ThreadPool,
+        /// A process that forks takes its memory along, but not its threads.
+        process: u32,
+    }
+
+    impl Threads {
+        pub(super) fn new(num_threads: usize) -> Result<Self, ThreadPoolBuildError> {
+            let pool = ThreadPoolBuilder::new().num_threads(num_threads).build()?;
+            Ok(Self { pool, process: process::id() })
+        }
+    }
+
+    /// Threads of this process, if there are as many idle ones. Here and below nobody waits for the lock: a thread that is
+    /// no more may have held it when the process forked.
+    pub(super) fn take(num_threads: usize) -> Option<Threads> {
+        let mut idle = IDLE.try_lock().ok()?;
+        let process = process::id();
+        // Not dropped: that would be to tell threads that are not there.
+        idle.extract_if(.., |threads| threads.process != process).for_each(mem::forget);
+        let at = idle.iter().position(|threads| threads.pool.current_num_threads() == num_threads)?;
+        Some(idle.swap_remove(at))
+    }
+
+    /// Keeps threads for later, at the expense of the oldest.
+    pub(super) fn put(threads: Threads) {
+        if let Ok(mut idle) = IDLE.try_lock() {
+            idle.push(threads);
+            if idle.len() > MOST {
+                idle.remove(0);
+            }
+        }
     }
 }
 
