@@ -276,16 +276,20 @@ pub(crate) fn buckets(
     count: usize,
     pairs: impl Iterator<Item = (u32, usize)> + Clone,
 ) -> (Vec<u32>, Vec<u32>) {
-    let mut starts = vec![0_u32; count + 1];
-    pairs.clone().for_each(|(_, bucket)| starts[bucket + 1] += 1);
-    for bucket in 1..starts.len() {
-        starts[bucket] += starts[bucket - 1];
+    // Two places on, so that what counts where the next item of a bucket goes ends as the start of the bucket after it.
+    let mut starts = vec![0_u32; count + 2];
+    pairs.clone().for_each(|(_, bucket)| starts[bucket + 2] += 1);
+    let mut sum = 0;
+    for start in &mut starts {
+        sum += *start;
+        *start = sum;
     }
-    let mut next = starts.clone();
-    let mut items = vec![0; starts[count] as usize];
+    let mut items = vec![0; sum as usize];
     for (item, bucket) in pairs {
-        items[next[bucket] as usize] = item;
-        next[bucket] += 1;
+        let next = &mut starts[bucket + 1];
+        items[*next as usize] = item;
+        *next += 1;
     }
+    starts.pop();
     (starts, items)
 }

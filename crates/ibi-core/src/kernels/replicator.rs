@@ -20,8 +20,7 @@ impl Payoffs {
     /// n players that gain nothing.
     #[must_use]
     pub fn zeros(n: usize) -> Self {
-        // At least one value more than n: see `padding`.
-        let stride = (n + 1).next_multiple_of(LANES);
+        let stride = n.max(1).next_multiple_of(LANES);
         Self { n, stride, values: vec![0.0; n * stride] }
     }
 
@@ -29,7 +28,9 @@ impl Payoffs {
     #[must_use]
     pub fn from_rows(n: usize, values: &[f32]) -> Self {
         let mut payoffs = Self::zeros(n);
-        for (row, values) in payoffs.padded_rows().zip(values.chunks_exact(n.max(1))) {
+        for (row, values) in
+            payoffs.values.chunks_exact_mut(payoffs.stride).zip(values.chunks_exact(n.max(1)))
+        {
             row[..n].copy_from_slice(values);
         }
         payoffs
@@ -58,14 +59,11 @@ impl Payoffs {
         &self.values[i * self.stride..][..self.stride]
     }
 
-    /// The rows with all their values: those beyond n play no part, whatever they are.
-    pub(crate) fn padded_rows(&mut self) -> impl Iterator<Item = &mut [f32]> {
-        self.values.chunks_exact_mut(self.stride)
-    }
-
-    /// A column of the padded rows that plays no part.
-    pub(crate) fn padding(&self) -> usize {
-        self.n
+    /// Sets what two players gain from each other.
+    #[inline]
+    pub(crate) fn set(&mut self, i: usize, j: usize, value: f32) {
+        self.values[i * self.stride + j] = value;
+        self.values[j * self.stride + i] = value;
     }
 
     /// Sets the rows to what `fill(i, row)` makes of them, in parallel.
@@ -91,17 +89,39 @@ pub fn replicator(payoffs: &Payoffs, steps: usize, interrupted: impl Fn() -> boo
             break;
         }
         let fitness = if n <= FEW { fitness_of_few(payoffs, &x) } else { fitness(payoffs, &x) };
-        let mean: f64 = x.iter().zip(&fitness).map(|(&x, &f)| f64::from(x) * f64::from(f)).sum();
-        if mean <= 0.0 {
+        if !step(&mut x, &fitness) {
             return None;
-        }
-        for (x, f) in x.iter_mut().zip(fitness) {
-            let next = (f64::from(*x) * f64::from(f) / mean) as f32;
-            *x = if next < EXTINCT { 0.0 } else { next };
         }
     }
     x.truncate(n);
     Some(x)
+}
+
+/// One step of `x`; false if its mean fitness is 0. In whole vectors, as both are.
+fn step(x: &mut [f32], fitness: &[f32]) -> bool {
+    let (x, fitness) = (x.as_chunks_mut::<LANES>().0, fitness.as_chunks::<LANES>().0);
+    simd(
+        #[inline(always)]
+        move || {
+            let mut sums = [0.0; LANES];
+            for (x, fitness) in x.iter().zip(fitness) {
+                for k in 0..LANES {
+                    sums[k] += f64::from(x[k]) * f64::from(fitness[k]);
+                }
+            }
+            let mean: f64 = sums.iter().sum();
+            if mean <= 0.0 {
+                return false;
+            }
+            for (x, fitness) in x.iter_mut().zip(fitness) {
+                for k in 0..LANES {
+                    let next = (f64::from(x[k]) * f64::from(fitness[k]) / mean) as f32;
+                    x[k] = if next < EXTINCT { 0.0 } else { next };
+                }
+            }
+            true
+        },
+    )
 }
 
 /// Pi x, row by row: large matrices come from memory, in its order.
@@ -116,7 +136,9 @@ fn fitness(Payoffs { n, stride, values }: &Payoffs, x: &[f32]) -> Vec<f32> {
             move || rows.chunks_exact(stride).map(|row| dot(row, x)).collect::<Vec<f32>>(),
         )
     });
-    chunks.concat()
+    let mut fitness = chunks.concat();
+    fitness.resize(stride, 0.0);
+    fitness
 }
 
 /// Players of whom a matrix stays in the cache.

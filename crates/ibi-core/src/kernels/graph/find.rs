@@ -189,7 +189,8 @@ impl Vicinity {
 
     /// The same for whole runs, copied piece by piece.
     fn of_runs(pairs: &Columns, runs: &(impl Iterator<Item = Range<usize>> + Clone)) -> Self {
-        let places = runs.clone().flat_map(|run| run.start as u32..run.end as u32).collect();
+        let mut places = Vec::new();
+        runs.clone().for_each(|run| places.extend(run.start as u32..run.end as u32));
         Self::filled(pairs, places, |_, axis, column| {
             runs.clone().for_each(|run| column.extend_from_slice(&axis[run]));
         })
@@ -234,27 +235,32 @@ impl Vicinity {
         }
     }
 
-    /// Adds the rows of the places `home`: the neighbours that come later in the order.
+    /// Adds the rows of the places `home`, with which this vicinity begins: the neighbours that come later in the order.
     fn push_rows(mut self, finder: &Finder<'_>, home: Range<usize>, rows: &mut Rows) {
         let inv_tau_sq = 1.0 / (finder.test.tau * finder.test.tau);
-        for place in home {
+        let mut found = Vec::new();
+        for (at, place) in home.enumerate() {
             let (p, q) = finder.places.pairs.pair(place);
-            let before = rows.neighbors.len();
-            let first = self.places.partition_point(|&other| other as usize <= place) / LANES * LANES;
+            let first = (at + 1) / LANES * LANES;
             self.join((p, q), finder.test, first);
+            found.clear();
             self.each_joined(first, |at| {
                 let other = self.places[at] as usize;
                 if other > place && finder.normals_fit(place, other) {
-                    let [a, b] = [(p, 0), (q, 3)].map(|(x, axis)| {
-                        let [dx, dy, dz] = [0, 1, 2].map(|k| self.coords[axis + k][at] - x[k]);
-                        (dx * dx + dy * dy + dz * dz).sqrt()
-                    });
-                    rows.neighbors.push(other as u32);
-                    // Rounding may put an edge at the very bound.
-                    rows.weights.push((1.0 - (a - b) * (a - b) * inv_tau_sq).max(f32::MIN_POSITIVE));
+                    found.push(at);
                 }
             });
-            rows.lens.push((rows.neighbors.len() - before) as u32);
+            // By itself, as roots take long and need not wait for each other.
+            rows.weights.extend(found.iter().map(|&at| {
+                let [a, b] = [(p, 0), (q, 3)].map(|(x, axis)| {
+                    let [dx, dy, dz] = [0, 1, 2].map(|k| self.coords[axis + k][at] - x[k]);
+                    (dx * dx + dy * dy + dz * dz).sqrt()
+                });
+                // Rounding may put an edge at the very bound.
+                (1.0 - (a - b) * (a - b) * inv_tau_sq).max(f32::MIN_POSITIVE)
+            }));
+            rows.neighbors.extend(found.iter().map(|&at| self.places[at]));
+            rows.lens.push(found.len() as u32);
         }
     }
 }

@@ -58,6 +58,8 @@ pub struct Graph {
     /// The node of each correspondence, or `NONE`.
     nodes: Vec<u32>,
     starts: Vec<usize>,
+    /// Where the neighbours after it begin.
+    middles: Vec<usize>,
     neighbors: Vec<u32>,
     weights: Vec<f32>,
     alive: Vec<bool>,
@@ -198,7 +200,15 @@ impl Graph {
     /// Neighbours of a node and the weights of the edges to them.
     #[must_use]
     pub fn edges(&self, node: u32) -> (&[u32], &[f32]) {
-        let range = self.starts[node as usize]..self.starts[node as usize + 1];
+        self.edges_of(self.starts[node as usize]..self.starts[node as usize + 1])
+    }
+
+    /// The same of the neighbours after it.
+    pub(crate) fn edges_upwards(&self, node: u32) -> (&[u32], &[f32]) {
+        self.edges_of(self.middles[node as usize]..self.starts[node as usize + 1])
+    }
+
+    fn edges_of(&self, range: Range<usize>) -> (&[u32], &[f32]) {
         (&self.neighbors[range.clone()], &self.weights[range])
     }
 }
@@ -224,7 +234,7 @@ impl Edges {
     fn weigh_by_common_neighbors(&mut self, interrupted: &(impl Fn() -> bool + Sync)) {
         /// Steps of the inner loop that make a part worth its memory, and parts at most. They depend on the graph and
         /// not on the threads: so do the sums.
-        const STEPS: usize = 1 << 19;
+        const STEPS: usize = 1 << 20;
         const MAX_PARTS: usize = 8;
         let degree = |j: u32| self.starts[j as usize + 1] - self.starts[j as usize];
         let steps: Vec<usize> =
@@ -296,6 +306,7 @@ impl Edges {
         }
         let num = 2 * self.neighbors.len();
         let (mut neighbors, mut weights) = (vec![0; num], vec![0.0; num]);
+        // Where the next neighbour of each node goes; in the end, where the upper half of its row begins.
         let mut next = starts.clone();
         for i in 0..self.len() {
             let (_, mine, w) = self.row(i);
@@ -308,7 +319,7 @@ impl Edges {
                 *at += 1;
             }
         }
-        Graph { starts, neighbors, weights, ..Graph::default() }
+        Graph { starts, middles: next, neighbors, weights, ..Graph::default() }
     }
 }
 

@@ -135,18 +135,21 @@ impl LocalGtm {
 /// Second-order payoffs of `players` with each other.
 fn payoffs(graph: &Graph, players: &[u32]) -> Payoffs {
     let mut payoffs = Payoffs::zeros(players.len());
-    // One column stands for all that do not play: whether a neighbour does is anybody's guess, and a store costs less
-    // than a wrong guess.
-    const { assert!(MAX_OTHERS + 1 < u8::MAX as usize) };
-    let mut columns = vec![payoffs.padding() as u8; graph.len()];
-    for (column, &player) in (0_u8..).zip(players) {
-        columns[player as usize] = column;
+    const NOBODY: u8 = u8::MAX;
+    const { assert!(MAX_OTHERS < NOBODY as usize) };
+    let mut seats = vec![NOBODY; graph.len()];
+    for (seat, &player) in (0..).zip(players) {
+        seats[player as usize] = seat;
     }
-    for (row, &i) in payoffs.padded_rows().zip(players) {
-        let (neighbors, weights) = graph.edges(i);
+    for (seat, &i) in players.iter().enumerate() {
+        let (neighbors, weights) = graph.edges_upwards(i);
         for (&j, &w) in neighbors.iter().zip(weights) {
-            row[columns[j as usize] as usize] = w;
+            // Whether a neighbour plays is anybody's guess, and a store costs less than a wrong guess: what is gained from
+            // one that does not play is put down to the player itself, and then forgotten.
+            let other = seats[j as usize];
+            payoffs.set(seat, if other == NOBODY { seat } else { other as usize }, w);
         }
+        payoffs.set(seat, seat, 0.0);
     }
     payoffs
 }
