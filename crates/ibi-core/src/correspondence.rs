@@ -11,7 +11,7 @@ use crate::kernels::columns::Columns;
 use crate::kernels::graph::{PairNormals, up_to_sign};
 use crate::kernels::par;
 use crate::params::Params;
-use crate::scene::Scene;
+use crate::scene::{Clouds, Scene};
 
 /// Correspondences as a user hands them in: nothing is checked until a [`crate::Registrar`] takes them.
 ///
@@ -55,7 +55,7 @@ impl Correspondences {
     }
 
     /// Rows of the clouds, source and target; where points are given instead, those of the nearest points.
-    fn rows(&self, scene: &Scene<'_>) -> (Vec<u32>, Vec<u32>) {
+    fn rows(&self, clouds: &Clouds<'_>) -> (Vec<u32>, Vec<u32>) {
         let side = |cloud: &PreparedCloud<'_>, column: usize| match &self.pairs {
             Pairs::Rows(rows) => rows.iter().map(|row| row[column] as u32).collect(),
             Pairs::Points(points) => {
@@ -63,7 +63,7 @@ impl Correspondences {
                 points.iter().filter_map(nearest).map(|(row, _)| row).collect()
             }
         };
-        (side(scene.source, 0), side(&scene.target, 1))
+        (side(clouds.source, 0), side(&clouds.target, 1))
     }
 
     /// M, the number of correspondences.
@@ -104,7 +104,7 @@ pub struct PointPairs {
 }
 
 impl PointPairs {
-    pub(crate) fn new(given: &Correspondences, scene: &Scene<'_>, oriented: bool) -> Result<Self, Error> {
+    pub(crate) fn new(given: &Correspondences, clouds: &Clouds<'_>, oriented: bool) -> Result<Self, Error> {
         let len = given.len();
         if len > u32::MAX as usize {
             return Err(Error::TooMany { argument: Argument::Corr, len });
@@ -113,15 +113,15 @@ impl PointPairs {
             check_similarity(similarity, len)?;
         }
         let (source, target): (Vec<_>, Vec<_>) = match &given.pairs {
-            Pairs::Rows(rows) => (look_up(rows, 0, scene.source)?, look_up(rows, 1, &scene.target)?),
+            Pairs::Rows(rows) => (look_up(rows, 0, clouds.source)?, look_up(rows, 1, &clouds.target)?),
             Pairs::Points(points) => points.iter().map(|&[p, q]| (p, q)).unzip(),
         };
         check_points(&source, Argument::Corr)?;
         check_points(&target, Argument::Corr)?;
-        let (source_rows, target_rows) = given.rows(scene);
-        let columns = Arc::new(Columns::new(&source, &target, scene.resolution));
+        let (source_rows, target_rows) = given.rows(clouds);
+        let columns = Arc::new(Columns::new(&source, &target, clouds.resolution));
         let by_target = ByTarget::new(&columns);
-        let normals = scene.source.normals.as_ref().zip(scene.target.normals.as_ref()).map(|(s, t)| {
+        let normals = clouds.source.normals.as_ref().zip(clouds.target.normals.as_ref()).map(|(s, t)| {
             let look_up = |normals: &[Vector3<f64>], rows: &[u32]| {
                 rows.iter().map(|&row| normals[row as usize].cast()).collect()
             };

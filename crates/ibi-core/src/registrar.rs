@@ -15,7 +15,7 @@ use crate::kernels::graph::Graph;
 use crate::kernels::par::{self, Pool};
 use crate::params::{Params, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
-use crate::scene::{Detail, Scene};
+use crate::scene::{Clouds, Detail, Scene};
 use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Polished, Ranked, SelectSeeds, Validate};
 use crate::state::{Judged, Play, Problem, State, Tried};
 
@@ -168,9 +168,13 @@ impl<'a> Registrar<'a> {
         correspondences: &Correspondences,
         observer: &mut dyn Observer,
     ) -> Result<Registration, Error> {
-        let mut state = self.begin(target, correspondences)?;
-        let stop_reason = self.run(&mut state, observer);
-        Ok(self.finish(state, stop_reason))
+        let pool = Arc::new(Pool::new(self.num_threads)?);
+        // Once and not for each step: to hand a job to other threads takes its time.
+        pool.install(|| {
+            let mut state = self.begin_on(&pool, target, correspondences)?;
+            let stop_reason = self.run(&mut state, observer);
+            Ok(self.finish(state, stop_reason))
+        })
     }
 
     /// Checks parameters and input, builds what all rounds share.
@@ -184,6 +188,15 @@ impl<'a> Registrar<'a> {
         target: &Cloud<'s>,
         correspondences: &Correspondences,
     ) -> Result<State<'s>, Error> {
+        self.begin_on(&Arc::new(Pool::new(self.num_threads)?), target, correspondences)
+    }
+
+    fn begin_on<'s>(
+        &'s self,
+        pool: &Arc<Pool>,
+        target: &Cloud<'s>,
+        correspondences: &Correspondences,
+    ) -> Result<State<'s>, Error> {
         let start = Instant::now();
         self.params.validate()?;
         if let Some(argument) = self.scs().needs()
@@ -191,7 +204,6 @@ impl<'a> Registrar<'a> {
         {
             return Err(Error::Missing { argument });
         }
-        let pool = Arc::new(Pool::new(self.num_threads)?);
         let (scene, pairs) = pool.install(|| {
             let prepared =
                 PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals, Argument::TgtFrames)?;
@@ -199,12 +211,15 @@ impl<'a> Registrar<'a> {
             if let Some(points) = measured {
                 check_points(points, Argument::Measured)?;
             }
-            let scene = Scene::new(&self.source, prepared, measured, &self.params)?;
-            let pairs = PointPairs::new(correspondences, &scene, self.params.oriented_normals)?;
-            Ok::<_, Error>((scene, pairs))
+            let clouds = Clouds::new(&self.source, prepared, &self.params)?;
+            let (near, pairs) = par::join(
+                || clouds.near(&self.params),
+                || PointPairs::new(correspondences, &clouds, self.params.oriented_normals),
+            );
+            Ok::<_, Error>((Scene::new(clouds, near, measured, &self.params), pairs?))
         })?;
         let interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
-        Ok(State::new(Problem::new(scene, pairs, interrupt), pool, start))
+        Ok(State::new(Problem::new(scene, pairs, interrupt), Arc::clone(pool), start))
     }
 
     /// Whether an optional argument is there; the others always are.

@@ -38,11 +38,17 @@ pub struct Scene<'a> {
     pub measured: Option<RangeImage>,
 }
 
-impl<'a> Scene<'a> {
+/// Both clouds, found to fit together, and pr.
+pub(crate) struct Clouds<'a> {
+    pub(crate) source: &'a PreparedCloud<'a>,
+    pub(crate) target: PreparedCloud<'a>,
+    pub(crate) resolution: f64,
+}
+
+impl<'a> Clouds<'a> {
     pub(crate) fn new(
         source: &'a PreparedCloud<'a>,
         target: PreparedCloud<'a>,
-        measured: Option<&[Point3<f64>]>,
         params: &Params,
     ) -> Result<Self, Error> {
         let (src, tgt) = (Argument::SrcNormals, Argument::TgtNormals);
@@ -71,9 +77,24 @@ impl<'a> Scene<'a> {
             // Points all in coincident pairs: no spacing, although there is an extent.
             return Err(Error::NoExtent { argument: Argument::Src });
         }
-        let reach = (2.0 * params.d_op_pr).max(params.t_he_pr) * resolution;
-        let (near_source, near_target) =
-            (Nearby::new(&source.points, reach), Nearby::new(&target.points, reach));
+        Ok(Self { source, target, resolution })
+    }
+
+    /// What lies near in each of them.
+    pub(crate) fn near(&self, params: &Params) -> [Nearby; 2] {
+        let reach = (2.0 * params.d_op_pr).max(params.t_he_pr) * self.resolution;
+        [&self.source.points, &self.target.points].map(|points| Nearby::new(points, reach))
+    }
+}
+
+impl<'a> Scene<'a> {
+    pub(crate) fn new(
+        clouds: Clouds<'a>,
+        [near_source, near_target]: [Nearby; 2],
+        measured: Option<&[Point3<f64>]>,
+        params: &Params,
+    ) -> Self {
+        let Clouds { source, target, resolution } = clouds;
         let mut scene = Self { source, target, resolution, near_source, near_target, measured: None };
         if scene.is_one_sided(params)
             && let Some(eye) = scene.target.viewpoint
@@ -83,7 +104,7 @@ impl<'a> Scene<'a> {
             let points = measured.unwrap_or(&scene.target.points);
             scene.measured = RangeImage::new(eye, points, PIXEL_PR * resolution);
         }
-        Ok(scene)
+        scene
     }
 }
 

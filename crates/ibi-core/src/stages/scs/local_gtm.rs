@@ -134,9 +134,9 @@ impl LocalGtm {
 
 /// Second-order payoffs of `players` with each other.
 fn payoffs(graph: &Graph, players: &[u32]) -> Payoffs {
-    let mut payoffs = Payoffs::zeros(players.len());
     const NOBODY: u8 = u8::MAX;
     const { assert!(MAX_OTHERS < NOBODY as usize) };
+    let mut payoffs = Payoffs::zeros(players.len());
     let mut seats = vec![NOBODY; graph.len()];
     for (seat, &player) in (0..).zip(players) {
         seats[player as usize] = seat;
