@@ -104,7 +104,8 @@ impl<'a> Registrar<'a> {
         self
     }
 
-    /// Threads per run. Default: as many as the process may use. The result does not depend on it.
+    /// Threads per run. Default: as many as the process may use. The result does not depend on it. They are kept for the next
+    /// run that wants as many.
     #[must_use]
     pub fn num_threads(mut self, num_threads: usize) -> Self {
         self.num_threads = Some(num_threads);

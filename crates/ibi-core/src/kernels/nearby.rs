@@ -64,8 +64,8 @@ impl Nearby {
         dispatch(NearestEach { nearby: self, bound: self.radius(distance), queries })
     }
 
-    /// Whether any point lies within `distance` of each of `queries`, up to rounding; it is at most the reach. A third of the
-    /// time of [`Self::nearest_each`].
+    /// Whether any point lies within `distance` of each of `queries`, up to rounding; it is at most the reach. Cheaper than
+    /// [`Self::nearest_each`].
     #[must_use]
     pub fn any_within_each(&self, distance: f64, queries: &[Point3<f64>]) -> Vec<bool> {
         dispatch(AnyWithinEach { nearby: self, bound: self.radius(distance), queries })

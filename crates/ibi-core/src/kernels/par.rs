@@ -96,7 +96,7 @@ mod idle {
         // Not dropped: that would be to tell threads that are not there.
         idle.extract_if(.., |threads| threads.process != process).for_each(mem::forget);
         let at = idle.iter().position(|threads| threads.pool.current_num_threads() == num_threads)?;
-        Some(idle.swap_remove(at))
+        Some(idle.remove(at))
     }
 
     /// Keeps threads for later, at the expense of the oldest.
