@@ -106,9 +106,9 @@ def register(
 
     Notes
     -----
-    The GIL is released. Ctrl-C ends the run within 0.1 s. Threads wait for the next call that wants as many; a
-    process that was forked starts its own. Stages of your own are called in the thread that
-    called this function; an exception in one, Ctrl-C among them, ends the run and is raised as it is.
+    The GIL is released. Ctrl-C ends the run within 0.1 s. Threads wait for the next call that wants as
+    many; a process that was forked starts its own. Stages of your own are called in the thread that called
+    this function; an exception in one, Ctrl-C among them, ends the run and is raised as it is.
 
     References
     ----------
