@@ -334,6 +334,7 @@ impl<'a> Registrar<'a> {
         play
     }
 
+    /// SCS, and how long it took.
     fn select(&self, context: &Context<'_>) -> (Ranked, Timings) {
         let mut timings = Timings::default();
         let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(context));

@@ -312,6 +312,7 @@ pub fn overlap(
     target_from_source: &Isometry3<f64>,
     contact: &Contact<'_>,
 ) -> f64 {
+    // Points with normals may be hidden or turned away; of others it is enough that some target point is near.
     if source.normals.is_some() {
         return overlap_of(&places(source, target, nearby, target_from_source, contact));
     }

@@ -8,9 +8,9 @@ use crate::Error;
 
 /// A thread pool of our own, or, for one thread, none at all.
 ///
-/// Its threads outlive it: the next pool of as many takes them over. New ones would cost a tenth of a millisecond, and
-/// start on the processor that starts them; until the system spreads them out, which takes it longer than a scene takes
-/// us, a second thread is of little use.
+/// Its threads outlive it: the next pool of as many takes them over. New ones would start on the processor that
+/// starts them, and until the system spreads them out, which takes it longer than a scene takes us, a second thread is of
+/// little use.
 #[derive(Debug)]
 pub struct Pool {
     #[cfg(feature = "rayon")]

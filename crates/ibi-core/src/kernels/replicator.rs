@@ -20,7 +20,7 @@ impl Payoffs {
     /// n players that gain nothing.
     #[must_use]
     pub fn zeros(n: usize) -> Self {
-        let stride = n.max(1).next_multiple_of(LANES);
+        let stride = n.max(1).next_multiple_of(LANES); // rows have a length even where there are none
         Self { n, stride, values: vec![0.0; n * stride] }
     }
 

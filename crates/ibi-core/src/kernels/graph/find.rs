@@ -241,13 +241,13 @@ impl Vicinity {
         let mut found = Vec::new();
         for (at, place) in home.enumerate() {
             let (p, q) = finder.places.pairs.pair(place);
+            // Whole vectors, so that a few before it are looked at too.
             let first = (at + 1) / LANES * LANES;
             self.join((p, q), finder.test, first);
             found.clear();
-            self.each_joined(first, |at| {
-                let other = self.places[at] as usize;
-                if other > place && finder.normals_fit(place, other) {
-                    found.push(at);
+            self.each_joined(first, |other| {
+                if other > at && finder.normals_fit(place, self.places[other] as usize) {
+                    found.push(other);
                 }
             });
             // By itself, as roots take long and need not wait for each other.

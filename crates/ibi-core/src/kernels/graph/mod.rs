@@ -58,7 +58,7 @@ pub struct Graph {
     /// The node of each correspondence, or `NONE`.
     nodes: Vec<u32>,
     starts: Vec<usize>,
-    /// Where the neighbours after it begin.
+    /// Where the later neighbours of each node begin.
     middles: Vec<usize>,
     neighbors: Vec<u32>,
     weights: Vec<f32>,
@@ -203,8 +203,8 @@ impl Graph {
         self.edges_of(self.starts[node as usize]..self.starts[node as usize + 1])
     }
 
-    /// The same of the neighbours after it.
-    pub(crate) fn edges_upwards(&self, node: u32) -> (&[u32], &[f32]) {
+    /// The same of its later neighbours.
+    pub(crate) fn later_edges(&self, node: u32) -> (&[u32], &[f32]) {
         self.edges_of(self.middles[node as usize]..self.starts[node as usize + 1])
     }
 
@@ -306,7 +306,7 @@ impl Edges {
         }
         let num = 2 * self.neighbors.len();
         let (mut neighbors, mut weights) = (vec![0; num], vec![0.0; num]);
-        // Where the next neighbour of each node goes; in the end, where the upper half of its row begins.
+        // Where the next neighbour of each node goes; in the end, where its later ones begin.
         let mut next = starts.clone();
         for i in 0..self.len() {
             let (_, mine, w) = self.row(i);

@@ -142,7 +142,7 @@ fn payoffs(graph: &Graph, players: &[u32]) -> Payoffs {
         seats[player as usize] = seat;
     }
     for (seat, &i) in players.iter().enumerate() {
-        let (neighbors, weights) = graph.edges_upwards(i);
+        let (neighbors, weights) = graph.later_edges(i);
         for (&j, &w) in neighbors.iter().zip(weights) {
             // Whether a neighbour plays is anybody's guess, and a store costs less than a wrong guess: what is gained from
             // one that does not play is put down to the player itself, and then forgotten.
