@@ -10,7 +10,7 @@ use std::hint::black_box;
 use std::time::Duration;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use ibi_core::CancelToken;
+use ibi_core::Interrupt;
 use ibi_core::features::{
     Descriptors, FPFH_DIM, Matching, Neighborhood, estimate_normals, fpfh, match_features, voxel_downsample,
 };
@@ -44,7 +44,7 @@ fn cloud(count: usize) -> (Vec<Point3<f64>>, Vec<Vector3<f64>>) {
 /// Why: these are most of the time from a scan to its poses, where correspondences are not given.
 fn features(c: &mut Criterion) {
     let (points, normals) = cloud(POINTS);
-    let never = CancelToken::default();
+    let never = Interrupt::never();
     let around = Neighborhood { radius: RADIUS, max_neighbors: 150 };
     let mut group = c.benchmark_group("feature");
     group.sample_size(10).warm_up_time(Duration::from_millis(200));

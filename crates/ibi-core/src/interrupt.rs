@@ -1,5 +1,6 @@
-//! Ending a run from outside: by a token, by the clock.
+//! Ending a computation from outside: by a token, by the clock.
 
+use std::fmt;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,20 +25,105 @@ impl CancelToken {
     }
 }
 
+/// What a computation is doing: all that can take long. Each asks its [`Interrupt`] while it works.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+#[allow(missing_docs)]
+pub enum Phase {
+    Prepare,
+    Graph,
+    Select,
+    Enhance,
+    Estimate,
+    Chance,
+    Polish,
+    Validate,
+    Contest,
+    JointCheck,
+    Rank,
+    Spacing,
+    Diameter,
+    Shadow,
+    Thin,
+    Normals,
+    Fpfh,
+    Match,
+    Plane,
+    SampleMesh,
+    OuterSurface,
+    Symmetries,
+    Metrics,
+}
+
+impl Phase {
+    /// All of them.
+    pub const ALL: [Self; 23] = [
+        Self::Prepare,
+        Self::Graph,
+        Self::Select,
+        Self::Enhance,
+        Self::Estimate,
+        Self::Chance,
+        Self::Polish,
+        Self::Validate,
+        Self::Contest,
+        Self::JointCheck,
+        Self::Rank,
+        Self::Spacing,
+        Self::Diameter,
+        Self::Shadow,
+        Self::Thin,
+        Self::Normals,
+        Self::Fpfh,
+        Self::Match,
+        Self::Plane,
+        Self::SampleMesh,
+        Self::OuterSurface,
+        Self::Symmetries,
+        Self::Metrics,
+    ];
+}
+
 /// What long computations ask from time to time: was the run cancelled, is it out of time?
-#[derive(Debug)]
+#[derive(Clone)]
 pub struct Interrupt {
     token: CancelToken,
     start: Instant,
     timeout_s: f64,
+    watcher: Option<Watcher>,
 }
 
+/// Is told each phase as it begins, by the thread that begins it.
+pub type Watcher = Arc<dyn Fn(Phase) + Send + Sync>;
+
 impl Interrupt {
-    pub(crate) fn new(token: CancelToken, start: Instant, timeout_s: Option<f64>) -> Self {
-        Self { token, start, timeout_s: timeout_s.unwrap_or(f64::INFINITY) }
+    /// Set once `token` is, or once `timeout_s` seconds have gone by since `start`.
+    #[must_use]
+    pub fn new(token: CancelToken, start: Instant, timeout_s: Option<f64>) -> Self {
+        Self { token, start, timeout_s: timeout_s.unwrap_or(f64::INFINITY), watcher: None }
     }
 
-    /// Whether the run is to end; what the caller returns then is thrown away.
+    /// One that is never set.
+    #[must_use]
+    pub fn never() -> Self {
+        Self::from(CancelToken::default())
+    }
+
+    /// With somebody who is told what the computation begins to do.
+    #[must_use]
+    pub fn with_watcher(mut self, watcher: Watcher) -> Self {
+        self.watcher = Some(watcher);
+        self
+    }
+
+    /// Tells the watcher, if there is one, that `phase` begins.
+    pub fn begin(&self, phase: Phase) {
+        if let Some(watcher) = &self.watcher {
+            watcher(phase);
+        }
+    }
+
+    /// Whether the computation is to end; what it returns then is thrown away.
     #[must_use]
     pub fn is_set(&self) -> bool {
         self.token.is_cancelled() || self.elapsed_s() >= self.timeout_s
@@ -56,5 +142,18 @@ impl Interrupt {
 
     fn elapsed_s(&self) -> f64 {
         self.start.elapsed().as_secs_f64()
+    }
+}
+
+/// Without a limit of time.
+impl From<CancelToken> for Interrupt {
+    fn from(token: CancelToken) -> Self {
+        Self::new(token, Instant::now(), None)
+    }
+}
+
+impl fmt::Debug for Interrupt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Interrupt").field("is_set", &self.is_set()).finish_non_exhaustive()
     }
 }

@@ -44,7 +44,7 @@ pub use claims::{Claims, NearClaims};
 pub use cloud::{Cloud, PreparedCloud};
 pub use correspondence::{Alive, Correspondences, PointPairs};
 pub use error::{Argument, Error};
-pub use interrupt::{CancelToken, Interrupt};
+pub use interrupt::{CancelToken, Interrupt, Phase, Watcher};
 pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};

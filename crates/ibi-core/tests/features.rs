@@ -6,19 +6,19 @@
     reason = "tests may panic, and compare what is exact"
 )]
 
-use ibi_core::CancelToken;
 use ibi_core::features::{
     Amount, Descriptors, FPFH_DIM, FeatureError, Matches, Matching, Mesh, Neighborhood, PlaneSearch, Views,
     dominant_plane, estimate_normals, fpfh, match_features, outer_surface, sample_mesh, voxel_downsample,
 };
 use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
+use ibi_core::{CancelToken, Interrupt};
 use ibi_testkit::strategies::{permutations, points, rigid_motions};
 use ibi_testkit::{Rng, features as naive};
 use proptest::prelude::*;
 
-fn never() -> CancelToken {
-    CancelToken::default()
+fn never() -> Interrupt {
+    Interrupt::never()
 }
 
 /// A bumpy ball of radius about 1, with normals that are a little off.
@@ -290,21 +290,22 @@ fn any_number_of_threads_gives_the_same_bits() {
 }
 
 #[test]
-fn who_cancels_gets_no_answer() {
+fn who_is_interrupted_gets_no_answer() {
     let (points, normals) = ball(100, 1);
-    let cancel = never();
-    cancel.cancel();
+    let token = CancelToken::default();
+    token.cancel();
+    let interrupt = Interrupt::from(token);
     let neighborhood = Neighborhood { radius: 0.4, max_neighbors: 30 };
-    let cancelled = Some(FeatureError::Cancelled);
-    assert_eq!(estimate_normals(&points, neighborhood, None, &cancel).err(), cancelled);
-    assert_eq!(fpfh(&points, &normals, neighborhood, None, &cancel).err(), cancelled);
+    let interrupted = Some(FeatureError::Interrupted);
+    assert_eq!(estimate_normals(&points, neighborhood, None, &interrupt).err(), interrupted);
+    assert_eq!(fpfh(&points, &normals, neighborhood, None, &interrupt).err(), interrupted);
     let rows = Descriptors { values: &[1.0, 2.0], dim: 1 };
-    assert_eq!(match_features(rows, rows, Matching::default(), &cancel).err(), cancelled);
+    assert_eq!(match_features(rows, rows, Matching::default(), &interrupt).err(), interrupted);
     let mesh = Mesh { vertices: &TRIANGLE, faces: &[[0, 1, 2]] };
-    assert_eq!(sample_mesh(&mesh, Amount::Count(9), 0, &cancel).err(), cancelled);
-    assert_eq!(outer_surface(&points, &normals, &mesh, &Views::default(), &cancel).err(), cancelled);
+    assert_eq!(sample_mesh(&mesh, Amount::Count(9), 0, &interrupt).err(), interrupted);
+    assert_eq!(outer_surface(&points, &normals, &mesh, &Views::default(), &interrupt).err(), interrupted);
     let search = PlaneSearch { distance: 0.1, min_share: 0.2, seed: 0 };
-    assert_eq!(dominant_plane(&points, &search, None, &cancel).err(), cancelled);
+    assert_eq!(dominant_plane(&points, &search, None, &interrupt).err(), interrupted);
 }
 
 // Coordinates that a map gives, and one stray point far away.

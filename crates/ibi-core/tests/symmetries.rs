@@ -13,7 +13,7 @@ use ibi_core::features::{Amount, Mesh, Sampled, sample_mesh};
 use ibi_core::metrics::{Criterion, Matching, Model, PoseThresholds, rotation_error_rad, score_scene_modulo};
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_core::{
-    Axis, CancelToken, Cloud, FindSymmetries, Registrar, Symmetries, SymmetryError, Turning, find_symmetries,
+    Axis, Cloud, FindSymmetries, Interrupt, Registrar, Symmetries, SymmetryError, Turning, find_symmetries,
 };
 use ibi_testkit::naive::farthest_off;
 use ibi_testkit::shapes::{self, Solid};
@@ -25,7 +25,7 @@ const Z: Axis = Axis { direction: Vector3::new(0.0, 0.0, 1.0), point: Point3::ne
 /// Points about 1/25 of the diameter apart.
 fn cloud(solid: &Solid, seed: u64) -> Sampled {
     let mesh = &Mesh { vertices: &solid.vertices, faces: &solid.faces };
-    sample_mesh(mesh, Amount::Count(600), seed, &CancelToken::default()).unwrap()
+    sample_mesh(mesh, Amount::Count(600), seed, &Interrupt::never()).unwrap()
 }
 
 fn found(cloud: &Sampled) -> Symmetries {

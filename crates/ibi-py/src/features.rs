@@ -3,7 +3,7 @@
 // pyo3 hands arguments over by value; a read-only array is a handle, cheap to own.
 #![expect(clippy::needless_pass_by_value)]
 
-use ibi_core::CancelToken;
+use ibi_core::Interrupt;
 use ibi_core::features::{
     self, Amount, Descriptors, FeatureError, Matching, Mesh, Neighborhood, PlaneSearch, Views,
 };
@@ -57,8 +57,8 @@ fn features_estimate_normals<'py>(
     let points = rows3(&points, Point3::new)?;
     let neighborhood = Neighborhood { radius, max_neighbors };
     let viewpoint = viewpoint.map(Point3::from);
-    let normals = in_pool(py, num_threads, |cancel| {
-        features::estimate_normals(&points, neighborhood, viewpoint, cancel)
+    let normals = in_pool(py, num_threads, |interrupt| {
+        features::estimate_normals(&points, neighborhood, viewpoint, interrupt)
     })?;
     vectors(py, normals)
 }
@@ -76,8 +76,8 @@ fn features_fpfh<'py>(
     let (points, normals) = (rows3(&points, Point3::new)?, rows3(&normals, Vector3::new)?);
     let neighborhood = Neighborhood { radius, max_neighbors };
     let keypoints = keypoints.map(|rows| keypoint_rows(&rows, points.len())).transpose()?;
-    let descriptors = in_pool(py, num_threads, |cancel| {
-        features::fpfh(&points, &normals, neighborhood, keypoints.as_deref(), cancel)
+    let descriptors = in_pool(py, num_threads, |interrupt| {
+        features::fpfh(&points, &normals, neighborhood, keypoints.as_deref(), interrupt)
     })?;
     let rows = descriptors.len();
     descriptors.into_flattened().into_pyarray(py).reshape([rows, features::FPFH_DIM])
@@ -115,9 +115,9 @@ fn features_match<'py>(
         return Err(InputError::new_err("descriptors must have at least 1 column"));
     }
     let matching = Matching { k, mutual, max_ratio: ratio };
-    let matches = in_pool(py, num_threads, |cancel| {
+    let matches = in_pool(py, num_threads, |interrupt| {
         let [src, tgt] = [&src, &tgt].map(|(values, dim)| Descriptors { values, dim: *dim });
-        features::match_features(src, tgt, matching, cancel)
+        features::match_features(src, tgt, matching, interrupt)
     })?;
     let count = matches.rows.len();
     let rows: Vec<i64> = matches.rows.into_flattened().into_iter().map(i64::from).collect();
@@ -140,8 +140,9 @@ fn features_dominant_plane<'py>(
     let points = rows3(&points, Point3::new)?;
     let search = PlaneSearch { distance, min_share, seed };
     let viewpoint = viewpoint.map(Point3::from);
-    let plane =
-        in_pool(py, num_threads, |cancel| features::dominant_plane(&points, &search, viewpoint, cancel))?;
+    let plane = in_pool(py, num_threads, |interrupt| {
+        features::dominant_plane(&points, &search, viewpoint, interrupt)
+    })?;
     Ok(plane.map(|p| (p.normal.into(), p.offset, p.inliers.into_pyarray(py), p.behind)))
 }
 
@@ -157,7 +158,7 @@ fn features_sample_mesh<'py>(
     let (vertices, faces) = mesh(&vertices, &faces)?;
     let mesh = Mesh { vertices: &vertices, faces: &faces };
     let amount = count.map_or(Amount::Spacing(spacing), Amount::Count);
-    let sampled = in_pool(py, Some(1), |cancel| features::sample_mesh(&mesh, amount, seed, cancel))?;
+    let sampled = in_pool(py, Some(1), |interrupt| features::sample_mesh(&mesh, amount, seed, interrupt))?;
     let points = sampled.points.into_iter().map(|p| p.coords).collect();
     Ok((vectors(py, points)?, vectors(py, sampled.normals)?))
 }
@@ -179,8 +180,9 @@ fn features_outer_surface<'py>(
     let (vertices, faces) = mesh(&vertices, &faces)?;
     let mesh = Mesh { vertices: &vertices, faces: &faces };
     let views = Views { count: num_views, max_angle_rad, lift };
-    let is_outer =
-        in_pool(py, num_threads, |cancel| features::outer_surface(&points, &normals, &mesh, &views, cancel))?;
+    let is_outer = in_pool(py, num_threads, |interrupt| {
+        features::outer_surface(&points, &normals, &mesh, &views, interrupt)
+    })?;
     Ok(is_outer.into_pyarray(py))
 }
 
@@ -205,11 +207,11 @@ fn mesh(vertices: &Rows<'_>, faces: &PyReadonlyArray2<'_, i64>) -> PyResult<Corn
 fn in_pool<T: Send>(
     py: Python<'_>,
     num_threads: Option<usize>,
-    job: impl FnOnce(&CancelToken) -> Result<T, FeatureError> + Send,
+    job: impl FnOnce(&Interrupt) -> Result<T, FeatureError> + Send,
 ) -> PyResult<T> {
     in_background(py, |cancel, _| {
         let pool = Pool::new(num_threads).map_err(|error| to_py_err(&error))?;
-        pool.install(|| job(&cancel)).map_err(to_py)
+        pool.install(|| job(&Interrupt::from(cancel))).map_err(to_py)
     })
 }
 

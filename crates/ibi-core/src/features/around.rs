@@ -9,7 +9,7 @@ use nalgebra::Point3;
 
 use super::FeatureError;
 use super::door::check_length;
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::columns::{columns, middle};
 use crate::kernels::grid::Grid;
 use crate::kernels::par;
@@ -126,11 +126,11 @@ impl Around {
     pub(super) fn map<T: Send, S: Default>(
         &self,
         places: &[u32],
-        cancel: &CancelToken,
+        interrupt: &Interrupt,
         each: impl Fn(usize, &Others, &mut S) -> T + Sync + Send,
     ) -> Result<Vec<T>, FeatureError> {
         let parts = par::chunks(places.len(), GRAIN, |run| {
-            if cancel.is_cancelled() {
+            if interrupt.is_set() {
                 return Vec::new();
             }
             let (mut others, mut scratch) = (Others::default(), S::default());
@@ -148,8 +148,8 @@ impl Around {
             );
             answers
         });
-        if cancel.is_cancelled() {
-            return Err(FeatureError::Cancelled);
+        if interrupt.is_set() {
+            return Err(FeatureError::Interrupted);
         }
         Ok(parts.into_iter().flatten().collect())
     }

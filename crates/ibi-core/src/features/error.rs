@@ -121,7 +121,7 @@ pub enum FeatureError {
         /// How many voxels are allowed along an axis.
         most: u64,
     },
-    /// The caller's [`crate::CancelToken`] was set.
-    #[error("cancelled")]
-    Cancelled,
+    /// The caller's [`crate::Interrupt`] was set.
+    #[error("interrupted")]
+    Interrupted,
 }

@@ -6,7 +6,7 @@ use super::FeatureError;
 use super::around::{Around, Neighborhood, Others};
 use super::door::{check_len, check_points, unit_normals};
 use super::pairs::{Pairs, SECTORS};
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 
 /// Numbers of a descriptor: three histograms.
 pub const FPFH_DIM: usize = 3 * SECTORS;
@@ -37,7 +37,7 @@ pub fn fpfh(
     normals: &[Vector3<f64>],
     neighborhood: Neighborhood,
     keypoints: Option<&[usize]>,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Vec<[f32; FPFH_DIM]>, FeatureError> {
     check_points("points", points)?;
     let normals = unit_normals("normals", normals, points.len())?;
@@ -53,20 +53,20 @@ pub fn fpfh(
         None => (all.clone(), all),
         Some(rows) => {
             let wanted = wanted_places(&around, rows);
-            let needed = with_neighbors(&around, &wanted, cancel)?;
+            let needed = with_neighbors(&around, &wanted, interrupt)?;
             (wanted, needed)
         }
     };
     let histograms = around.map(
         &needed,
-        cancel,
+        interrupt,
         #[inline(always)]
         |place, others, pairs: &mut Pairs| spfh(&around, &normals, place, others, pairs),
     )?;
     // By place, zeros where nobody asks.
     let histograms = if needed.len() == n { histograms } else { spread(&needed, histograms, n) };
     let sorted =
-        around.map(&wanted, cancel, |place, others, (): &mut ()| mean(&histograms, place, others))?;
+        around.map(&wanted, interrupt, |place, others, (): &mut ()| mean(&histograms, place, others))?;
 
     let mut at_place = vec![0; n];
     wanted.iter().zip(0..).for_each(|(&place, i)| at_place[place as usize] = i);
@@ -102,8 +102,8 @@ fn wanted_places(around: &Around, rows: &[usize]) -> Vec<u32> {
 }
 
 /// These places and their neighbours, each once and ascending.
-fn with_neighbors(around: &Around, wanted: &[u32], cancel: &CancelToken) -> Result<Vec<u32>, FeatureError> {
-    let lists = around.map(wanted, cancel, |_, others, (): &mut ()| others.places().to_vec())?;
+fn with_neighbors(around: &Around, wanted: &[u32], interrupt: &Interrupt) -> Result<Vec<u32>, FeatureError> {
+    let lists = around.map(wanted, interrupt, |_, others, (): &mut ()| others.places().to_vec())?;
     let mut is_needed = vec![false; around.order().len()];
     wanted.iter().chain(lists.iter().flatten()).for_each(|&place| is_needed[place as usize] = true);
     Ok((0..).zip(is_needed).filter(|&(_, is_needed)| is_needed).map(|(place, _)| place).collect())

@@ -7,7 +7,7 @@
 use std::ops::Range;
 
 use super::{Descriptors, FeatureError};
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::simd::simd;
 
 /// Rows of a leaf, and what is treated side by side.
@@ -47,18 +47,18 @@ struct Search {
 
 impl<'a> Leaves<'a> {
     /// Large tables take seconds, hence the token.
-    pub(super) fn new(rows: Descriptors<'a>, cancel: &CancelToken) -> Result<Self, FeatureError> {
+    pub(super) fn new(rows: Descriptors<'a>, interrupt: &Interrupt) -> Result<Self, FeatureError> {
         let dim = rows.dim;
         let mut order: Vec<u32> = (0..rows.len() as u32).collect();
         let variances = variances(&rows, &order);
         let mut axes: Vec<u32> = (0..dim as u32).collect();
         axes.sort_by(|&a, &b| variances[b as usize].total_cmp(&variances[a as usize]));
-        split(&rows, &mut order, cancel);
+        split(&rows, &mut order, interrupt);
         let count = order.len().div_ceil(LANES);
         let (mut centres, mut radii) = (Vec::new(), Vec::new());
         for leaf in order.chunks(LANES) {
-            if cancel.is_cancelled() {
-                return Err(FeatureError::Cancelled);
+            if interrupt.is_set() {
+                return Err(FeatureError::Interrupted);
             }
             let mean = |d: usize| leaf.iter().map(|&row| f64::from(rows.row(row)[d])).sum::<f64>();
             let centre: Vec<f32> = (0..dim).map(|d| (mean(d) / leaf.len() as f64) as f32).collect();
@@ -76,13 +76,13 @@ impl<'a> Leaves<'a> {
     }
 
     /// Tells `found` for each of the `queries` the `want` nearest rows, or all if there are no more; of those before the
-    /// call was cancelled.
+    /// call was interrupted.
     pub(super) fn nearest(
         &self,
         queries: &Descriptors<'_>,
         run: Range<usize>,
         want: usize,
-        cancel: &CancelToken,
+        interrupt: &Interrupt,
         mut found: impl FnMut(usize, &[Hit]),
     ) {
         let mut search = Search::default();
@@ -91,7 +91,7 @@ impl<'a> Leaves<'a> {
             || {
                 for query in run {
                     // One may take a millisecond.
-                    if cancel.is_cancelled() {
+                    if interrupt.is_set() {
                         return;
                     }
                     self.query(queries.row(query as u32), want, &mut search);
@@ -228,8 +228,8 @@ fn blocks<'r>(count: usize, axes: &[u32], row: impl Fn(usize) -> Option<&'r [f32
 }
 
 /// Sorts rows so that each `LANES` of them are alike: halves them by the dimension of most spread, and again.
-fn split(rows: &Descriptors<'_>, order: &mut [u32], cancel: &CancelToken) {
-    if order.len() <= LANES || cancel.is_cancelled() {
+fn split(rows: &Descriptors<'_>, order: &mut [u32], interrupt: &Interrupt) {
+    if order.len() <= LANES || interrupt.is_set() {
         return;
     }
     let axis = widest(rows, order);
@@ -238,8 +238,8 @@ fn split(rows: &Descriptors<'_>, order: &mut [u32], cancel: &CancelToken) {
     let value = |row: u32| rows.row(row)[axis];
     order.select_nth_unstable_by(half, |&a, &b| value(a).total_cmp(&value(b)).then(a.cmp(&b)));
     let (low, high) = order.split_at_mut(half);
-    split(rows, low, cancel);
-    split(rows, high, cancel);
+    split(rows, low, interrupt);
+    split(rows, high, interrupt);
 }
 
 /// The dimension of the largest variance.

@@ -3,7 +3,7 @@
 use super::FeatureError;
 use super::door::check_len;
 use super::leaves::Leaves;
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::par;
 
 /// Descriptors of any kind, a row for each point.
@@ -88,7 +88,7 @@ pub fn match_features(
     source: Descriptors<'_>,
     target: Descriptors<'_>,
     matching: Matching,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Matches, FeatureError> {
     if source.dim != target.dim {
         return Err(FeatureError::DimMismatch { src: source.dim, tgt: target.dim });
@@ -104,11 +104,11 @@ pub fn match_features(
     {
         return Err(FeatureError::Setting { argument: "ratio", value, allowed: "above 0 and at most 1" });
     }
-    let back = if mutual { Some(nearest_rows(target, source, k, cancel)?) } else { None };
-    let leaves = Leaves::new(source, cancel)?;
+    let back = if mutual { Some(nearest_rows(target, source, k, interrupt)?) } else { None };
+    let leaves = Leaves::new(source, interrupt)?;
     let parts = par::chunks(target.len(), GRAIN, |run| {
         let mut part = Matches::default();
-        leaves.nearest(&target, run, k + 1, cancel, |row, hits| {
+        leaves.nearest(&target, run, k + 1, interrupt, |row, hits| {
             let row = row as u32;
             let left_out = hits.get(k).map_or(f64::INFINITY, |hit| hit.0.sqrt());
             for &(dist_sq, other) in hits.iter().take(k) {
@@ -122,8 +122,8 @@ pub fn match_features(
         });
         part
     });
-    if cancel.is_cancelled() {
-        return Err(FeatureError::Cancelled);
+    if interrupt.is_set() {
+        return Err(FeatureError::Interrupted);
     }
     let mut matches = Matches::default();
     for part in parts {
@@ -143,18 +143,18 @@ fn nearest_rows(
     rows: Descriptors<'_>,
     queries: Descriptors<'_>,
     k: usize,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Vec<Vec<u32>>, FeatureError> {
-    let leaves = Leaves::new(rows, cancel)?;
+    let leaves = Leaves::new(rows, interrupt)?;
     let parts = par::chunks(queries.len(), GRAIN, |run| {
         let mut part = Vec::new();
-        leaves.nearest(&queries, run, k, cancel, |_, hits| {
+        leaves.nearest(&queries, run, k, interrupt, |_, hits| {
             part.push(hits.iter().map(|hit| hit.1).collect());
         });
         part
     });
-    if cancel.is_cancelled() {
-        Err(FeatureError::Cancelled)
+    if interrupt.is_set() {
+        Err(FeatureError::Interrupted)
     } else {
         Ok(parts.into_iter().flatten().collect())
     }

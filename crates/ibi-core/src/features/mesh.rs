@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::FeatureError;
 use super::door::{check_len, check_length, check_points};
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::rng::Rng;
 
 /// A surface of triangles. Seen from outside, the corners of a face run counter-clockwise: that is where its normal
@@ -85,7 +85,7 @@ pub fn sample_mesh(
     mesh: &Mesh<'_>,
     amount: Amount,
     seed: u64,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Sampled, FeatureError> {
     mesh.check()?;
     if let Amount::Spacing(spacing) = amount {
@@ -112,8 +112,8 @@ pub fn sample_mesh(
             if is_full(&kept) {
                 break;
             }
-            if draw % 1024 == 0 && cancel.is_cancelled() {
-                return Err(FeatureError::Cancelled);
+            if draw % 1024 == 0 && interrupt.is_set() {
+                return Err(FeatureError::Interrupted);
             }
             let (point, normal) = surface.draw(&mut rng);
             if kept.has_room(&point, &normal, radius) {

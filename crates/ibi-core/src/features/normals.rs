@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use super::FeatureError;
 use super::around::{Around, Neighborhood, Others};
 use super::door::{check_place, check_points};
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 
 /// The normal of each point: across the plane through its neighbours, by PCA (Hoppe et al. 1992).
 ///
@@ -22,7 +22,7 @@ pub fn estimate_normals(
     points: &[Point3<f64>],
     neighborhood: Neighborhood,
     viewpoint: Option<Point3<f64>>,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Vec<Vector3<f64>>, FeatureError> {
     check_points("points", points)?;
     check_place("viewpoint", viewpoint.as_ref())?;
@@ -31,7 +31,7 @@ pub fn estimate_normals(
     let places: Vec<u32> = (0..points.len() as u32).collect();
     let sorted = around.map(
         &places,
-        cancel,
+        interrupt,
         #[inline(always)]
         |place, others, (): &mut ()| {
             let to_eye = viewpoint.map(|eye| eye - Point3::from(around.point(place)));

@@ -10,7 +10,7 @@ use nalgebra::{Point3, Vector3};
 use super::FeatureError;
 use super::door::{check_points, unit_normals};
 use super::mesh::Mesh;
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::grid::buckets;
 use crate::kernels::par;
 use crate::kernels::sight::{across, corners, direction};
@@ -52,7 +52,7 @@ pub fn outer_surface(
     normals: &[Vector3<f64>],
     mesh: &Mesh<'_>,
     views: &Views,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Vec<bool>, FeatureError> {
     check_points("points", points)?;
     let normals = unit_normals("normals", normals, points.len())?;
@@ -63,8 +63,8 @@ pub fn outer_surface(
     let cos = views.max_angle_rad.cos();
     let mut is_seen = vec![false; points.len()];
     for view in 0..views.count {
-        if cancel.is_cancelled() {
-            return Err(FeatureError::Cancelled);
+        if interrupt.is_set() {
+            return Err(FeatureError::Interrupted);
         }
         let to_eye = direction(view, views.count);
         let facing = |&row: &usize| !is_seen[row] && normals[row].dot(&to_eye) >= cos;

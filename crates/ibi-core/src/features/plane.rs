@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use super::FeatureError;
 use super::door::{check_length, check_place, check_points};
 use super::normals::least_axis;
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::columns::{columns, middle};
 use crate::kernels::par;
 use crate::kernels::rng::Rng;
@@ -65,7 +65,7 @@ pub fn dominant_plane(
     points: &[Point3<f64>],
     search: &PlaneSearch,
     viewpoint: Option<Point3<f64>>,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Option<Plane>, FeatureError> {
     check_points("points", points)?;
     check_place("viewpoint", viewpoint.as_ref())?;
@@ -78,7 +78,7 @@ pub fn dominant_plane(
     if points.len() < 3 {
         return Ok(None);
     }
-    let Some(drawn) = best_draw(points, search, cancel)? else { return Ok(None) };
+    let Some(drawn) = best_draw(points, search, interrupt)? else { return Ok(None) };
     let Some(plane) = fitted(points, drawn, search.distance) else { return Ok(None) };
     let inliers: Vec<bool> = points.iter().map(|p| plane.distance(p).abs() <= search.distance).collect();
     if (inliers.iter().filter(|&&near| near).count() as f64) < share * points.len() as f64 {
@@ -108,7 +108,7 @@ impl Candidate {
 fn best_draw(
     points: &[Point3<f64>],
     search: &PlaneSearch,
-    cancel: &CancelToken,
+    interrupt: &Interrupt,
 ) -> Result<Option<Candidate>, FeatureError> {
     let mut rng = Rng::new(search.seed, 0, 0);
     let all: Vec<u32> = (0..points.len() as u32).collect();
@@ -120,7 +120,7 @@ fn best_draw(
     let triplets: Vec<[usize; 3]> =
         (0..draws).map(|_| [0; 3].map(|_: usize| rng.below(sample.len()))).collect();
     let parts = par::chunks(draws, GRAIN, |run| {
-        if cancel.is_cancelled() {
+        if interrupt.is_set() {
             return Vec::new();
         }
         let counted = |draw: usize| {
@@ -130,8 +130,8 @@ fn best_draw(
         };
         run.filter_map(counted).collect::<Vec<_>>()
     });
-    if cancel.is_cancelled() {
-        return Err(FeatureError::Cancelled);
+    if interrupt.is_set() {
+        return Err(FeatureError::Interrupted);
     }
     let first_best = |best: Option<(u32, Candidate)>, next: (u32, Candidate)| match best {
         Some(best) if best.0 >= next.0 => Some(best),

@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::SymmetryError;
 use crate::features::{Neighborhood, estimate_normals, voxel_downsample};
-use crate::interrupt::CancelToken;
+use crate::interrupt::Interrupt;
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::Nearby;
 use crate::kernels::overlap::{Contact, Surface};
@@ -80,7 +80,7 @@ impl Shape {
         } else {
             // Enough neighbours for a plane, however the points are spread.
             let around = Neighborhood { radius: 3.0 * gap, max_neighbors: 20 };
-            estimate_normals(&points, around, None, &CancelToken::default())?
+            estimate_normals(&points, around, None, &Interrupt::never())?
         };
         let nearby = Nearby::new(&points, REACH);
         let [rough, fine] =
