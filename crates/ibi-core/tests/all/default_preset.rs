@@ -1,11 +1,5 @@
 //! The default preset on scenes whose truth is known: all instances, each once, nothing else, whatever the frame, the
 //! unit, the order, the signs of normals and the threads.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::stages::scs::LocalGtm;

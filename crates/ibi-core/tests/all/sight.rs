@@ -1,5 +1,4 @@
 //! What a camera can see of a model, what it saw of the scene, and what follows for a pose.
-#![allow(clippy::unwrap_used, clippy::float_cmp, reason = "tests may panic")]
 
 use std::f64::consts::PI;
 

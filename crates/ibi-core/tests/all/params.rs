@@ -1,6 +1,4 @@
 //! Parameters as plain data: round trips, and how an option says that it has no value.
-#![cfg(feature = "serde")]
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use ibi_core::Params;
 use serde::Deserialize;

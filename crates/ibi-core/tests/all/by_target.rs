@@ -1,5 +1,4 @@
 //! Pairs by the place of their target points: brute force in `f64`, and the laws that hold whatever the data.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use std::collections::HashSet;
 use std::ops::Range;

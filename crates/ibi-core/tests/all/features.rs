@@ -1,10 +1,4 @@
 //! The features: each against its naive twin, and the laws that hold whatever the data.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
 use ibi_core::features::{
     Amount, Descriptors, FPFH_DIM, FeatureError, Matches, Matching, Mesh, Neighborhood, PlaneSearch, Views,

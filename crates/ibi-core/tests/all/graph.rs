@@ -1,5 +1,4 @@
 //! The compatibility graph and the grid under it: naive twins, and the laws that hold whatever the data.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use std::collections::HashSet;
 

@@ -1,11 +1,5 @@
 //! Every variant of every stage, in every combination, on normal and hard scenes: what passes between the
 //! stages keeps its invariants, runs end, results do not depend on threads, and transform with the data.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
 use std::collections::HashSet;
 use std::f64::consts::PI;

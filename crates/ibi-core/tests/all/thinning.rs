@@ -1,6 +1,5 @@
 //! The compatibility graph where correspondences have too many neighbours: which become nodes, and that the graph is
 //! the definition's on those that do.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use std::collections::HashSet;
 

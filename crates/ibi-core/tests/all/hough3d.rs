@@ -1,6 +1,5 @@
 //! Local reference frames and the accumulator against their naive twins and laws; what `hough3d` makes of frames that
 //! are given, and of those it computes; which frames are refused.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use ibi_core::kernels::frames::{frame, frames};
 use ibi_core::kernels::hough::{peak, shares};

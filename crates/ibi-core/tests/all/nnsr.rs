@@ -1,12 +1,9 @@
 //! `nnsr`: its seeds against a plain sort, on similarities of any scale; no seed leads twice.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
-
-mod common;
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 
-use common::Mock;
+use crate::mock::Mock;
 use ibi_core::stages::hv::InlierCount;
 use ibi_core::stages::scs::Nnsr;
 use ibi_core::stages::{Context, Ranked, SelectSeeds};

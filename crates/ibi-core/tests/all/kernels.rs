@@ -1,11 +1,5 @@
 //! Each kernel against its naive twin, and the laws that hold whatever the data: rigid motion, scale,
 //! permutation, swapping source and target.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
 use std::collections::HashSet;
 use std::ops::RangeInclusive;

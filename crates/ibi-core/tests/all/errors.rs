@@ -1,5 +1,4 @@
 //! Bad input: the exact error and its one line. Unusual but legal input: a good result.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use ibi_core::kernels::compatibility::Payoff;
 use ibi_core::nalgebra::{Point3, Vector3};

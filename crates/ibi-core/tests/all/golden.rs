@@ -6,9 +6,8 @@
 //! files anew and look at the difference:
 //!
 //! ```text
-//! IBI_BLESS=1 cargo test -p ibi-core --all-features --test golden
+//! IBI_BLESS=1 cargo test -p ibi-core --all-features --test all golden
 //! ```
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;

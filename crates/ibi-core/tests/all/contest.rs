@@ -1,20 +1,12 @@
 //! Contests: hypotheses that passed validation wait for `n_contest` rounds, then the best become instances. With
 //! mocks first, then with the single-view preset.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
-
-mod common;
 
 use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
-use common::Mock;
+use crate::mock::Mock;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::stages::te::Gsac;
 use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
@@ -111,7 +103,7 @@ fn history(plan: Plan, params: Params) -> Vec<Vec<usize>> {
 fn the_best_of_a_contest_is_the_first_instance() {
     let plan: Plan = &[(0, 0.9), (20, 0.85), (40, 1.0), (60, 0.95)];
     let history = history(plan, contest(4));
-    assert_eq!(history[..3], [vec![], vec![], vec![]], "nothing before the end of the contest");
+    assert_eq!(history[..3], [const { Vec::<usize>::new() }; 3], "nothing before the end of the contest");
     assert_eq!(history[3], [40, 60, 0, 20]);
     assert_eq!(history.last().unwrap().len(), 4);
     // Found in the order of their values, but each by its own round.

@@ -1,14 +1,6 @@
 //! What speaks for a pose: the support of its correspondences against chance, and how closely the clouds fit.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
-#[path = "common/oriented.rs"]
-mod oriented;
-
+use crate::oriented::{Oriented, clouds};
 use ibi_core::kernels::evidence::Support;
 use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, chance_fit, fit, overlap, places};
@@ -18,7 +10,6 @@ use ibi_core::kernels::sight::View;
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_testkit::naive;
 use ibi_testkit::strategies::{point, rigid_motions};
-use oriented::{Oriented, clouds};
 use proptest::prelude::*;
 
 // ----------------------------------------------------------------------------------------------------- support

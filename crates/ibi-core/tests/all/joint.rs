@@ -1,10 +1,7 @@
 //! The joint check: at the end of a run all poses compete for the target, and those with too little of their own go.
 //! With mocks first, then with the built-in validation.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
-mod common;
-
-use common::Mock;
+use crate::mock::Mock;
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::stages::ce::Voting;
 use ibi_core::stages::hv::Evidence;

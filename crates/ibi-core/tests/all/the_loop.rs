@@ -1,14 +1,11 @@
 //! The loop itself, with stages that are mocks: what it calls, removes, records, and when it ends.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
-
-mod common;
 
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use common::Mock;
+use crate::mock::Mock;
 use ibi_core::nalgebra::{Isometry3, Point3};
 use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Verdict};
 use ibi_core::{

@@ -1,11 +1,5 @@
 //! Triangles and cliques of small graphs against their naive twins; what the stages built on them make of a scene, and
 //! that they say so when a limit cut them off.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
 use std::collections::BTreeSet;
 

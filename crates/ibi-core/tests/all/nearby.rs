@@ -1,11 +1,5 @@
 //! The nearest point within a reach, and the spacing of a cloud: brute force in `f64`, and the laws that hold whatever
 //! the data.
-#![allow(
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::float_cmp,
-    reason = "tests may panic, and compare what is exact"
-)]
 
 use std::collections::HashSet;
 

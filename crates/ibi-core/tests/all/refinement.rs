@@ -1,12 +1,8 @@
 //! Refinement and overlap: where source points come to lie, what iterative closest points make of a pose, and
 //! who may claim a scene point.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::float_cmp, reason = "tests may panic")]
 
-mod common;
-#[path = "common/oriented.rs"]
-mod oriented;
-
-use common::Mock;
+use crate::mock::Mock;
+use crate::oriented::{Oriented, clouds};
 use ibi_core::kernels::icp::{Stop, icp};
 use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, MIN_FACING_COS, Place, Surface, overlap, overlap_of, places};
@@ -22,7 +18,6 @@ use ibi_testkit::Rng;
 use ibi_testkit::naive;
 use ibi_testkit::scenes::asymmetric_model;
 use ibi_testkit::strategies::{points, rigid_motions};
-use oriented::{Oriented, clouds};
 use proptest::prelude::*;
 
 fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact<'static> {

@@ -1,4 +1,4 @@
-//! What several test crates share.
+//! Stages that are closures.
 
 use ibi_core::stages::{
     Context, Enhance, Estimate, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict,

@@ -1,12 +1,5 @@
 //! Symmetries: as they are declared, and as they are found on shapes that have known ones.
 
-#![allow(
-    clippy::unwrap_used,
-    clippy::float_cmp,
-    missing_docs,
-    reason = "tests may panic, and compare what is exact"
-)]
-
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use ibi_core::features::{Amount, Mesh, Sampled, sample_mesh};
