@@ -9,7 +9,7 @@ use nalgebra::Isometry3;
 use crate::cloud::{Cloud, PreparedCloud, check_points};
 use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
-use crate::interrupt::{CancelToken, Interrupt};
+use crate::interrupt::{CancelToken, Interrupt, Phase, Watcher};
 use crate::joint::{joint_check, supports};
 use crate::kernels::graph::Graph;
 use crate::kernels::par::{self, Pool};
@@ -70,6 +70,7 @@ pub struct Registrar<'a> {
     hv: Option<Box<dyn Validate>>,
     num_threads: Option<usize>,
     cancel: CancelToken,
+    watcher: Option<Watcher>,
 }
 
 impl<'a> Registrar<'a> {
@@ -94,6 +95,7 @@ impl<'a> Registrar<'a> {
             hv: None,
             num_threads: None,
             cancel: CancelToken::default(),
+            watcher: None,
         }
     }
 
@@ -116,6 +118,13 @@ impl<'a> Registrar<'a> {
     #[must_use]
     pub fn cancel_token(mut self, token: CancelToken) -> Self {
         self.cancel = token;
+        self
+    }
+
+    /// Is told each phase of the runs as it begins.
+    #[must_use]
+    pub fn watcher(mut self, watcher: Watcher) -> Self {
+        self.watcher = Some(watcher);
         self
     }
 
@@ -219,7 +228,10 @@ impl<'a> Registrar<'a> {
             );
             Ok::<_, Error>((Scene::new(clouds, near, measured, &self.params), pairs?))
         })?;
-        let interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
+        let mut interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
+        if let Some(watcher) = &self.watcher {
+            interrupt = interrupt.with_watcher(Arc::clone(watcher));
+        }
         Ok(State::new(Problem::new(scene, pairs, interrupt), Arc::clone(pool), start))
     }
 
@@ -336,6 +348,7 @@ impl<'a> Registrar<'a> {
 
     /// SCS, and how long it took.
     fn select(&self, context: &Context<'_>) -> (Ranked, Timings) {
+        context.interrupt.begin(Phase::Select);
         let mut timings = Timings::default();
         let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(context));
         (seeds, timings)
@@ -363,6 +376,7 @@ impl<'a> Registrar<'a> {
             return Play { seeds, timings, ..Play::default() };
         }
         let dense = timed(&mut timings.ce_s, || self.ce().enhance(context, &seeds));
+        context.interrupt.begin(Phase::Estimate);
         let estimate = timed(&mut timings.te_s, || self.te().estimate_pose(context, &dense));
         let judged = estimate.hypothesis.map(|raw| {
             let before = self.known(context.scene, tried, &raw, None);

@@ -13,6 +13,7 @@ use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, P
 use pyo3::prelude::*;
 
 use crate::register::{in_background, rows3};
+use crate::runs::watched;
 use crate::{InputError, to_py_err};
 
 /// Adds the functions of this file to the module.
@@ -211,7 +212,7 @@ fn in_pool<T: Send>(
 ) -> PyResult<T> {
     in_background(py, |cancel, _| {
         let pool = Pool::new(num_threads).map_err(|error| to_py_err(&error))?;
-        pool.install(|| job(&Interrupt::from(cancel))).map_err(to_py)
+        pool.install(|| job(&watched(Interrupt::from(cancel)))).map_err(to_py)
     })
 }
 

@@ -4,6 +4,7 @@ mod features;
 mod metrics;
 mod params;
 mod register;
+mod runs;
 mod stages;
 mod symmetries;
 
@@ -35,6 +36,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("InputError", m.py().get_type::<InputError>())?;
     m.add("ParamsError", m.py().get_type::<ParamsError>())?;
     params::register(m)?;
+    runs::register(m)?;
     register::register(m)?;
     metrics::register(m)?;
     features::register(m)?;

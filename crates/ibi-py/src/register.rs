@@ -9,10 +9,11 @@ use ibi_core::nalgebra::{Matrix3, Point3, Vector3};
 use ibi_core::{CancelToken, Cloud, Correspondences, PreparedCloud, Registrar, Registration, Round};
 use numpy::ndarray::ArrayView2;
 use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PySystemExit, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
+use crate::runs::{self, Run};
 use crate::stages::Own;
 use crate::symmetries::Symmetries;
 use crate::{InputError, params, to_py_err};
@@ -46,7 +47,7 @@ impl Source {
         if let Some(symmetries) = symmetries {
             cloud = cloud.with_symmetries(symmetries.0.clone());
         }
-        let prepared = py.detach(|| PreparedCloud::source(&cloud)).map_err(|e| to_py_err(&e))?;
+        let prepared = in_background(py, |_, _| PreparedCloud::source(&cloud).map_err(|e| to_py_err(&e)))?;
         Ok(Self(Arc::new(prepared)))
     }
 
@@ -113,6 +114,9 @@ fn register_clouds<'py>(
         };
         let run = || {
             let mut registrar = Registrar::of(source).params(params).cancel_token(cancel);
+            if let Some(watcher) = runs::watcher() {
+                registrar = registrar.watcher(watcher);
+            }
             if let Some(num_threads) = num_threads {
                 registrar = registrar.num_threads(num_threads);
             }
@@ -180,8 +184,9 @@ pub(crate) fn in_background<T: Send>(
     job: impl FnOnce(CancelToken, Caller) -> PyResult<T> + Send,
 ) -> PyResult<T> {
     let cancel = CancelToken::default();
+    let run = Run::enter(py, &cancel)?;
     let token = cancel.clone();
-    py.detach(|| {
+    let result = py.detach(|| {
         std::thread::scope(|scope| {
             // The job's end is seen by this: with it goes the last sender.
             let (calls, asked) = channel::<Call>();
@@ -194,10 +199,11 @@ pub(crate) fn in_background<T: Send>(
                     break;
                 }
                 if outcome.is_ok() {
-                    outcome = Python::attach(|py| match happened {
+                    let attached = Python::try_attach(|py| match happened {
                         Ok(call) => call(py),
                         Err(_) => py.check_signals(),
                     });
+                    outcome = attached.unwrap_or_else(|| Err(PySystemExit::new_err("the process ends")));
                     if outcome.is_err() {
                         cancel.cancel();
                     }
@@ -206,18 +212,21 @@ pub(crate) fn in_background<T: Send>(
             let result = worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
             outcome.and(result)
         })
-    })
+    });
+    run.go_on()?; // what was cut off is no result
+    result
 }
 
 /// Calls the Python callback; `False` ends the run.
 fn tell(callback: Option<&Py<PyAny>>, round: &Round) -> PyResult<ControlFlow<()>> {
     let Some(callback) = callback else { return Ok(ControlFlow::Continue(())) };
     let round = json(round)?;
-    Python::attach(|py| {
+    let told = Python::try_attach(|py| {
         let answer = callback.bind(py).call1((round,))?;
         let stop = answer.is_instance_of::<pyo3::types::PyBool>() && !answer.is_truthy()?;
         Ok(if stop { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
-    })
+    });
+    told.unwrap_or(Ok(ControlFlow::Break(()))) // the process ends
 }
 
 fn with_normals<'a>(cloud: Cloud<'a>, normals: Option<&PyReadonlyArray2<'_, f64>>) -> PyResult<Cloud<'a>> {
