@@ -6,6 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any, TypeVar
 
+from ibi_rs import _interrupts
+
 _R = TypeVar("_R")
 
 
@@ -33,7 +35,8 @@ class RayExecutor(Executor):
 
     def __init__(self, **options: Any) -> None:
         try:
-            import ray
+            with _interrupts.held():
+                import ray
         except ImportError as error:
             raise ImportError(f"Ray is needed: pip install 'ibi_rs[ray]' ({error})") from error
         self._ray = ray

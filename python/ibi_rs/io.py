@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ibi_rs import _interrupts
 from ibi_rs._core import InputError
 from ibi_rs._view import depth_points
 
@@ -210,7 +211,8 @@ def _reading(path: Path, read: Callable[[], Any]) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        return read()
+        with _interrupts.remembered():
+            return read()
     except (InputError, _Missing):
         raise
     except Exception as error:  # readers raise whatever the garbage in a file leads them to
@@ -224,6 +226,7 @@ def _extra(module: str) -> Any:
     import importlib
 
     try:
-        return importlib.import_module(module)
+        with _interrupts.held():
+            return importlib.import_module(module)
     except ImportError as error:
         raise _Missing(f"{module} is needed: pip install 'ibi_rs[io]' ({error})") from error

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ibi_rs import _interrupts
+
 if TYPE_CHECKING:
     from ibi_rs.registration import Registration
 
@@ -54,11 +56,12 @@ def instances(
         If matplotlib is not installed; the message names the extra.
     """
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+        with _interrupts.held():
+            from matplotlib import colormaps
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
+            from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError(f"pictures need matplotlib: pip install 'ibi_rs[plot]' ({error})") from error
-    from matplotlib import colormaps
 
     scene, model = np.asarray(tgt, np.float64), np.asarray(src, np.float64)
     poses = np.asarray(registration, np.float64).reshape(-1, 4, 4)

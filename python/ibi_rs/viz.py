@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from ibi_rs import _interrupts
 from ibi_rs._core import InputError
 from ibi_rs._inputs import Points, _correspondences, _count, _points
 
@@ -81,7 +82,8 @@ def record(
         The file cannot be written.
     """
     try:
-        import rerun as rr
+        with _interrupts.held():
+            import rerun as rr
     except ImportError as error:
         raise ImportError(f"recordings need Rerun: pip install 'ibi_rs[viz]' ({error})") from error
     scene, model = _points("tgt", tgt), _points("src", src)
@@ -129,7 +131,8 @@ def record(
 
 
 def _blueprint() -> Any:
-    import rerun.blueprint as rrb
+    with _interrupts.held():
+        import rerun.blueprint as rrb
 
     numbers = rrb.Vertical(
         rrb.TimeSeriesView(

@@ -13,13 +13,14 @@ from typing import Annotated, Any, NoReturn
 import numpy as np
 
 import ibi_rs as ibi
-from ibi_rs import io, metrics
+from ibi_rs import _interrupts, io, metrics
 from ibi_rs.symmetries import _bop_entry as bop_entry
 
 try:
-    import typer
-    from rich.console import Console
-    from rich.table import Table
+    with _interrupts.held():
+        import typer
+        from rich.console import Console
+        from rich.table import Table
 except ImportError as error:
     raise SystemExit(f"ibi: the command needs more: pip install 'ibi_rs[cli]' ({error})") from None
 

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ibi_rs import _interrupts
+
 __all__ = ["RADII", "dense_descriptors", "load_open3d", "nearest"]
 
 RADII = (0.15, 0.3, 0.5)
@@ -21,7 +23,8 @@ _NORMAL_NEIGHBORS = 30
 def load_open3d(who: str = "FPFH descriptors need") -> Any:
     """Open3D, imported late: it is optional, large and slow to load."""
     try:
-        import open3d
+        with _interrupts.held():
+            import open3d
     except ImportError as error:  # also when it is installed and one of its system libraries is not
         message = f"{who} Open3D: pip install 'ibi_rs[open3d]' ({error})"
         raise ImportError(message) from error
