@@ -4,9 +4,8 @@
 use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::Duration;
 
-use crate::mock::Mock;
+use crate::mock::{Mock, long_enough};
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_core::stages::te::Gsac;
 use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
@@ -283,15 +282,16 @@ fn nothing_is_lost_at_max_rounds() {
 #[test]
 fn nothing_is_lost_at_a_timeout() {
     // The fourth round outlasts the timeout and is thrown away.
-    let slow = planned(WAITING, Params { timeout_s: Some(0.5), ..endless() }).with_ce(Mock(
-        |context: &Context<'_>, seeds: &Ranked| {
+    let result = long_enough(3, |timeout_s, reached| {
+        let waits = move |context: &Context<'_>, seeds: &Ranked| {
+            reached(context.round);
             while context.round == 3 && !context.interrupt.is_set() {
-                std::thread::sleep(Duration::from_millis(1));
+                std::thread::yield_now();
             }
             seeds.clone()
-        },
-    ));
-    let result = register(&slow);
+        };
+        register(&planned(WAITING, Params { timeout_s: Some(timeout_s), ..endless() }).with_ce(Mock(waits)))
+    });
     assert!(matches!(result.stop_reason, StopReason::Timeout { .. }), "{}", result.stop_reason);
     assert_eq!((result.rounds.len(), sorted_places(&result)), (3, ALL.to_vec()));
 }

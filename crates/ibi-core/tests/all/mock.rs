@@ -1,4 +1,7 @@
-//! Stages that are closures.
+//! Stages that are closures, and a time limit that strikes where it is to.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use ibi_core::stages::{
     Context, Enhance, Estimate, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict,
@@ -29,4 +32,23 @@ impl<F: Fn(&Context<'_>, &Hypothesis) -> Verdict + Send + Sync> Validate for Moc
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
         (self.0)(context, hypothesis)
     }
+}
+
+/// What `run` gives with a time limit that is long enough for it to reach `round`, on whatever machine; it is called with
+/// the limit, and with what is to be told of the rounds it has reached.
+pub(crate) fn long_enough<T>(round: u32, run: impl Fn(f64, Box<dyn Fn(u32) + Send + Sync>) -> T) -> T {
+    for doublings in 0..14 {
+        let is_reached = Arc::new(AtomicBool::new(false));
+        let inside = Arc::clone(&is_reached);
+        let reached = move |at| {
+            if at == round {
+                inside.store(true, Ordering::SeqCst);
+            }
+        };
+        let result = run(0.01 * f64::from(1 << doublings), Box::new(reached));
+        if is_reached.load(Ordering::SeqCst) {
+            return result;
+        }
+    }
+    panic!("round {round} is not reached within a minute");
 }

@@ -2,15 +2,19 @@
 
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use crate::mock::Mock;
+use crate::mock::{Mock, long_enough};
 use ibi_core::nalgebra::{Isometry3, Point3};
 use ibi_core::stages::{Context, Estimate, Hypothesis, Ranked, Verdict};
 use ibi_core::{
-    CancelToken, Cloud, Correspondences, Params, Registrar, Registration, Removal, Round, StopReason,
+    CancelToken, Cloud, Correspondences, Params, Phase, Registrar, Registration, Removal, Round, StopReason,
 };
+
+/// After so long a test fails rather than hangs.
+const WATCHDOG: Duration = Duration::from_secs(120);
 
 /// Not `Params::default()`, which may change.
 fn base() -> Params {
@@ -255,22 +259,23 @@ fn ends_with_max_rounds_and_max_instances() {
 
 #[test]
 fn ends_with_timeout_and_throws_the_unfinished_round_away() {
-    let slow = mocked().params(Params { timeout_s: Some(0.02), ..base() }).with_te(Mock(
-        |context: &Context<'_>, _: &Ranked| {
-            if context.round == 1 {
-                std::thread::sleep(Duration::from_millis(40));
+    let (limit, result) = long_enough(1, |timeout_s, reached| {
+        let slow = move |context: &Context<'_>, _: &Ranked| {
+            reached(context.round);
+            while context.round == 1 && !context.interrupt.is_set() {
+                std::thread::yield_now();
             }
             shifted(0.0)
-        },
-    ));
-    let result = register(&slow);
+        };
+        let params = Params { timeout_s: Some(timeout_s), ..base() };
+        (timeout_s, register(&mocked().params(params).with_te(Mock(slow))))
+    });
     let StopReason::Timeout { value, threshold } = result.stop_reason else {
         panic!("{}", result.stop_reason)
     };
-    assert!((0.02..5.0).contains(&value), "{value}");
-    assert!((threshold - 0.02).abs() < 1e-12);
-    assert!(result.rounds.len() <= 1, "the slow round was not finished in time");
-    assert_eq!(result.poses.len(), result.rounds.len());
+    assert!(value >= limit, "{value}");
+    assert_eq!(threshold, limit);
+    assert_eq!((result.rounds.len(), result.poses.len()), (1, 1), "the slow round was not finished in time");
 
     let at_once = register(&mocked().params(Params { timeout_s: Some(0.0), ..base() }));
     assert!(matches!(at_once.stop_reason, StopReason::Timeout { threshold: 0.0, .. }));
@@ -295,7 +300,7 @@ fn ends_when_another_thread_cancels_during_a_long_stage() {
     let token = CancelToken::default();
     let started = Arc::new(AtomicU32::new(0));
     let inside = Arc::clone(&started);
-    let deadline = Instant::now() + Duration::from_secs(20); // fail rather than hang
+    let deadline = Instant::now() + WATCHDOG;
     let endless =
         mocked().cancel_token(token.clone()).with_te(Mock(move |context: &Context<'_>, _: &Ranked| {
             inside.fetch_add(1, Ordering::SeqCst);
@@ -324,18 +329,20 @@ fn ends_when_another_thread_cancels_during_a_long_stage() {
 
 #[test]
 fn built_in_stages_can_be_cancelled_too() {
-    // 16384^2 payoffs over 4 billion generations: only the token ends this.
+    // 16384^2 payoffs over 4 billion generations: only the token ends this, once they have begun.
     let scene = ibi_testkit::scenes::Recipe::default().build();
     let token = CancelToken::default();
+    let (begins, begun) = channel();
     let scs = ibi_core::stages::scs::Gtm { n_gtm: u32::MAX, ..Default::default() };
     let registrar = Registrar::new(&Cloud::new(&scene.source))
         .unwrap()
         .params(Params { scs: scs.into(), ..base() })
+        .watcher(Arc::new(move |phase| _ = begins.send(phase)))
         .cancel_token(token.clone());
     let correspondences = Correspondences::from_rows(scene.rows.clone());
     let result = std::thread::scope(|scope| {
-        scope.spawn(|| {
-            std::thread::sleep(Duration::from_millis(30));
+        scope.spawn(move || {
+            while begun.recv_timeout(WATCHDOG).is_ok_and(|phase| phase != Phase::Select) {}
             token.cancel();
         });
         registrar.register(&Cloud::new(&scene.target), &correspondences).unwrap()
@@ -444,14 +451,19 @@ fn a_registrar_can_be_used_again_and_from_several_threads() {
 
 #[test]
 fn timings_add_up() {
+    // What the enhancement takes, by its own clock.
+    let spent = Arc::new(Mutex::new(Duration::ZERO));
+    let own = Arc::clone(&spent);
     let registrar = mocked().params(Params { max_rounds: Some(2), ..base() }).with_ce(Mock(
-        |_: &Context<'_>, seeds: &Ranked| {
+        move |_: &Context<'_>, seeds: &Ranked| {
+            let start = Instant::now();
             std::thread::sleep(Duration::from_millis(5));
+            *own.lock().unwrap() += start.elapsed();
             seeds.clone()
         },
     ));
     let times = register(&registrar).timings;
-    assert!(times.ce_s >= 0.01 && times.te_s < times.ce_s);
+    assert!(times.ce_s >= spent.lock().unwrap().as_secs_f64());
     let parts = times.prepare_s + times.scs_s + times.ce_s + times.te_s + times.hv_s;
     assert!(parts <= times.total_s);
 }
