@@ -116,8 +116,14 @@ def symmetries_find(points: _Floats, normals: _Floats | None, tolerance: float) 
 
 # Features.
 
+# With `timeout_s`, counted from the call, a TimeoutError says that time has run out.
+
 def features_voxel_downsample(
-    points: _Floats, normals: _Floats | None, voxel: float
+    points: _Floats,
+    normals: _Floats | None,
+    voxel: float,
+    num_threads: int | None,
+    timeout_s: float | None = None,
 ) -> tuple[_Floats, _Floats | None]: ...
 def features_estimate_normals(
     points: _Floats,
@@ -125,6 +131,7 @@ def features_estimate_normals(
     max_neighbors: int,
     viewpoint: Sequence[float] | None,
     num_threads: int | None,
+    timeout_s: float | None = None,
 ) -> _Floats: ...
 def features_fpfh(
     points: _Floats,
@@ -133,6 +140,7 @@ def features_fpfh(
     max_neighbors: int,
     keypoints: _Ints | None,
     num_threads: int | None,
+    timeout_s: float | None = None,
 ) -> npt.NDArray[np.float32]: ...
 def features_match(
     src_feat: npt.NDArray[np.float32],
@@ -141,6 +149,7 @@ def features_match(
     mutual: bool,
     ratio: float | None,
     num_threads: int | None,
+    timeout_s: float | None = None,
 ) -> tuple[_Ints, _Floats]: ...
 def features_dominant_plane(
     points: _Floats,
@@ -149,6 +158,7 @@ def features_dominant_plane(
     viewpoint: Sequence[float] | None,
     seed: int,
     num_threads: int | None,
+    timeout_s: float | None = None,
 ) -> tuple[list[float], float, npt.NDArray[np.bool_], float] | None: ...
 def features_sample_mesh(
     vertices: _Floats, faces: _Ints, count: int | None, spacing: float, seed: int
@@ -182,9 +192,11 @@ def metrics_rotation_error_rad(a: _Floats, b: _Floats, symmetries: Symmetries) -
 def metrics_translation_error(a: _Floats, b: _Floats, symmetries: Symmetries) -> float: ...
 def metrics_frobenius_distance(a: _Floats, b: _Floats) -> float: ...
 def metrics_add(model: _Floats, predicted: _Floats, truth: _Floats) -> float: ...
-def metrics_add_s(model: _Floats, predicted: _Floats, truth: _Floats) -> float: ...
+def metrics_add_s(
+    model: _Floats, predicted: _Floats, truth: _Floats, num_threads: int | None
+) -> float: ...
 def metrics_mssd(model: _Floats, predicted: _Floats, truth: _Floats, symmetries: Symmetries) -> float: ...
-def metrics_diameter(points: _Floats) -> float: ...
+def metrics_diameter(points: _Floats, num_threads: int | None) -> float: ...
 def metrics_assignment(cost: _Floats) -> _Ints: ...
 def metrics_score_pose(
     predicted: _Floats,
@@ -193,6 +205,7 @@ def metrics_score_pose(
     rotation_rad: float,
     translation: float,
     symmetries: Symmetries,
+    num_threads: int | None,
 ) -> _Scored: ...
 def metrics_score_add_s(
     predicted: _Floats,
@@ -201,9 +214,15 @@ def metrics_score_add_s(
     model: _Floats,
     diameter_fraction: float,
     symmetries: Symmetries,
+    num_threads: int | None,
 ) -> _Scored: ...
 def metrics_mssd_recall(
-    predicted: _Floats, truth: _Floats, matching: str, model: _Floats, symmetries: Symmetries
+    predicted: _Floats,
+    truth: _Floats,
+    matching: str,
+    model: _Floats,
+    symmetries: Symmetries,
+    num_threads: int | None,
 ) -> tuple[float, _Floats]: ...
 def metrics_mean_score(
     matching: str, counts: Sequence[tuple[int, int, int, int]]

@@ -71,6 +71,10 @@ def voxel_downsample(
     TypeError
         An argument is of another type than above.
 
+    Notes
+    -----
+    The GIL is released. Ctrl-C ends the call within 0.1 s.
+
     Examples
     --------
     >>> import ibi_rs as ibi
@@ -79,7 +83,7 @@ def voxel_downsample(
     [[0.0, 0.0, 0.1], [0.0, 0.0, 5.0]]
     """
     return _core.features_voxel_downsample(
-        _points("points", points), _optional("normals", normals), _number("voxel", voxel)
+        _points("points", points), _optional("normals", normals), _number("voxel", voxel), _num_threads(None)
     )
 
 
@@ -162,7 +166,7 @@ def fpfh(
 
     Equal to Open3D's ``compute_fpfh_feature`` with ``KDTreeSearchParamHybrid(radius, max_neighbors)`` up to
     rounding: an angle at the edge of a bin may fall into the next one. Each of the three histograms of eleven
-    bins has a sum of 200, or 0 for a point without neighbours.
+    bins has a sum of 200; of 100 for a point whose neighbours all lie at its own place, and 0 for one without.
 
     Parameters
     ----------
@@ -286,6 +290,10 @@ def dominant_plane(
         An argument is of another type than above.
     ValueError
         ``num_threads`` or ``IBI_NUM_THREADS`` is no integer from 1 to 65535.
+
+    Notes
+    -----
+    The GIL is released. Ctrl-C ends the call within 0.1 s.
 
     References
     ----------

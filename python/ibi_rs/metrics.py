@@ -430,7 +430,9 @@ def add_s(model: npt.ArrayLike, predicted: npt.ArrayLike, truth: npt.ArrayLike) 
     >>> metrics.add(stick, flipped, np.eye(4)), metrics.add_s(stick, flipped, np.eye(4))
     (2.0, 0.0)
     """
-    return _core.metrics_add_s(_points(model, "model"), _pose(predicted, "predicted"), _pose(truth, "truth"))
+    return _core.metrics_add_s(
+        _points(model, "model"), _pose(predicted, "predicted"), _pose(truth, "truth"), _num_threads(None)
+    )
 
 
 def mssd(
@@ -480,7 +482,8 @@ def mssd(
 def diameter(points: npt.ArrayLike) -> float:
     """Largest distance between two points, exactly; 0 for fewer than two.
 
-    About O(n log n) for elongated shapes; O(n^2) at worst, for points all equally far from their centroid.
+    About O(n log n). Of more than 4096 points all about equally far from their centroid the last one or two
+    of its digits may differ.
 
     Parameters
     ----------
@@ -499,7 +502,7 @@ def diameter(points: npt.ArrayLike) -> float:
     TypeError
         If `points` is not made of real numbers.
     """
-    return _core.metrics_diameter(_points(points, "points"))
+    return _core.metrics_diameter(_points(points, "points"), _num_threads(None))
 
 
 def assignment(cost: npt.ArrayLike) -> npt.NDArray[np.int64]:
@@ -592,12 +595,19 @@ def score_scene(
             math.radians(criterion.rotation_deg),
             float(criterion.translation),
             held,
+            _num_threads(None),
         )
     elif isinstance(criterion, AddS):
         if model is None:
             raise ValueError("model must be given when criterion is AddS")
         scored = _core.metrics_score_add_s(
-            estimates, truths, matching, _points(model, "model"), float(criterion.diameter_fraction), held
+            estimates,
+            truths,
+            matching,
+            _points(model, "model"),
+            float(criterion.diameter_fraction),
+            held,
+            _num_threads(None),
         )
     else:
         raise TypeError(f"criterion must be PoseThresholds or AddS, not {type(criterion).__name__}")
@@ -701,6 +711,7 @@ def mssd_recall(
         matching,
         _points(model, "model"),
         _as_symmetries(symmetries),
+        _num_threads(None),
     )
     return MssdRecall(average, tuple(recalls.tolist()))
 

@@ -50,10 +50,10 @@ fn features(c: &mut Criterion) {
     group.sample_size(10).warm_up_time(Duration::from_millis(200));
     group.measurement_time(Duration::from_millis(800));
 
-    let thin = voxel_downsample(&points, Some(&normals), 0.02).unwrap();
+    let thin = voxel_downsample(&points, Some(&normals), 0.02, &Interrupt::never()).unwrap();
     assert!(thin.points.len() > 1000);
     group.bench_function(format!("voxel_downsample/{POINTS}"), |b| {
-        b.iter(|| voxel_downsample(black_box(&points), Some(&normals), 0.02));
+        b.iter(|| voxel_downsample(black_box(&points), Some(&normals), 0.02, &Interrupt::never()));
     });
     let few = Neighborhood { radius: 0.045, max_neighbors: 30 };
     let found = estimate_normals(&points, few, None, &never).unwrap();

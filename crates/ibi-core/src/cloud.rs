@@ -8,6 +8,7 @@ use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::checks::{first_not_finite, unit_vectors};
 use crate::error::{Argument, Error};
+use crate::interrupt::Interrupt;
 use crate::kernels::nearby::mean_spacing;
 use crate::kernels::neighbors::Neighbors;
 use crate::kernels::overlap::Surface;
@@ -178,10 +179,15 @@ impl<'a> PreparedCloud<'a> {
 }
 
 impl PreparedCloud<'_> {
-    /// Largest distance of two points, in data units; measured when first asked for.
+    /// Largest distance of two points, in data units; measured when first asked for. `None` if interrupted.
     #[must_use]
-    pub fn diameter(&self) -> f64 {
-        *self.diameter.get_or_init(|| diameter(&self.points))
+    pub fn diameter(&self, interrupt: &Interrupt) -> Option<f64> {
+        if let Some(&known) = self.diameter.get() {
+            return Some(known);
+        }
+        // Not from within `get_or_init`: threads that wait for each other there could be those that have the work to do.
+        let diameter = diameter(&self.points, interrupt).ok()?;
+        Some(*self.diameter.get_or_init(|| diameter))
     }
 
     /// kd-tree over the points, built when first asked for: for nearest points at any distance.
@@ -189,15 +195,19 @@ impl PreparedCloud<'_> {
         self.tree.get_or_init(|| Neighbors::new(&self.points))
     }
 
-    /// Which points the cloud itself hides, at a glance those of the probe; worked out when first asked for. `None`
-    /// without normals.
-    pub(crate) fn own_shadow(&self, detail: Detail) -> Option<&OwnShadow> {
-        let normals = self.normals.as_deref()?;
-        let [all, probe] = self.shadows.get_or_init(|| {
-            let all = OwnShadow::new(&self.points, normals, self.spacing);
+    /// Works out which points the cloud itself hides, if it has normals and nobody has done so before; nothing if
+    /// interrupted.
+    pub(crate) fn shade(&self, interrupt: &Interrupt) {
+        let Some(normals) = self.normals.as_deref().filter(|_| self.shadows.get().is_none()) else { return };
+        if let Some(all) = OwnShadow::until(&self.points, normals, self.spacing, interrupt) {
             let probe = all.on(&self.probe.rows);
-            [all, probe]
-        });
+            self.shadows.get_or_init(|| [all, probe]);
+        }
+    }
+
+    /// Which points the cloud itself hides, at a glance those of the probe; `None` before [`Self::shade`].
+    pub(crate) fn own_shadow(&self, detail: Detail) -> Option<&OwnShadow> {
+        let [all, probe] = self.shadows.get()?;
         Some(if detail == Detail::Glance { probe } else { all })
     }
 

@@ -103,6 +103,15 @@ impl Interrupt {
         Self { token, start, timeout_s: timeout_s.unwrap_or(f64::INFINITY), watcher: None }
     }
 
+    /// With a limit of time in the place of the one that it has, if any is given.
+    #[must_use]
+    pub fn with_timeout(mut self, start: Instant, timeout_s: Option<f64>) -> Self {
+        if let Some(timeout_s) = timeout_s {
+            (self.start, self.timeout_s) = (start, timeout_s);
+        }
+        self
+    }
+
     /// One that is never set.
     #[must_use]
     pub fn never() -> Self {
@@ -121,6 +130,16 @@ impl Interrupt {
         if let Some(watcher) = &self.watcher {
             watcher(phase);
         }
+    }
+
+    /// Begins `phase`, unless the computation is to end; returns whether it goes on.
+    #[must_use]
+    pub fn enter(&self, phase: Phase) -> bool {
+        if self.is_set() {
+            return false;
+        }
+        self.begin(phase);
+        !self.is_set()
     }
 
     /// Whether the computation is to end; what it returns then is thrown away.

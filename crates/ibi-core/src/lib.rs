@@ -32,6 +32,7 @@ mod interrupt;
 mod joint;
 pub mod kernels;
 pub mod metrics;
+mod pace;
 mod params;
 mod registrar;
 mod registration;

@@ -4,6 +4,7 @@ use nalgebra::{Isometry3, Point3};
 
 use crate::cloud::{PROBE_POINTS, PreparedCloud, SCOUT_POINTS};
 use crate::error::{Argument, Error};
+use crate::interrupt::Interrupt;
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::Nearby;
 use crate::kernels::overlap::{Contact, Fit, Place, Surface, chance_fit, fit, overlap, own_fit, places};
@@ -100,7 +101,7 @@ impl<'a> Scene<'a> {
             && let Some(eye) = scene.target.viewpoint
         {
             // Now, not first from within a parallel map: both are one themselves.
-            scene.source.own_shadow(Detail::Look);
+            scene.source.shade(&Interrupt::never());
             let points = measured.unwrap_or(&scene.target.points);
             scene.measured = RangeImage::new(eye, points, PIXEL_PR * resolution);
         }

@@ -3,18 +3,19 @@
 // pyo3 hands arguments over by value; a read-only array is a handle, cheap to own.
 #![expect(clippy::needless_pass_by_value)]
 
+use std::time::Instant;
+
 use ibi_core::Interrupt;
 use ibi_core::features::{
     self, Amount, Descriptors, FeatureError, Matching, Mesh, Neighborhood, PlaneSearch, Views,
 };
-use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Point3, Vector3};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::exceptions::PyTimeoutError;
 use pyo3::prelude::*;
 
-use crate::register::{in_background, rows3};
-use crate::runs::watched;
-use crate::{InputError, to_py_err};
+use crate::InputError;
+use crate::register::{self, rows3};
 
 /// Adds the functions of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -32,21 +33,27 @@ type Rows<'py> = PyReadonlyArray2<'py, f64>;
 type Floats<'py> = Bound<'py, PyArray2<f64>>;
 
 #[pyfunction]
+#[pyo3(signature = (points, normals, voxel, num_threads, timeout_s=None))]
 fn features_voxel_downsample<'py>(
     py: Python<'py>,
     points: Rows<'py>,
     normals: Option<Rows<'py>>,
     voxel: f64,
+    num_threads: Option<usize>,
+    timeout_s: Option<f64>,
 ) -> PyResult<(Floats<'py>, Option<Floats<'py>>)> {
     let points = rows3(&points, Point3::new)?;
     let normals = normals.map(|normals| rows3(&normals, Vector3::new)).transpose()?;
-    let thinned =
-        py.detach(|| features::voxel_downsample(&points, normals.as_deref(), voxel)).map_err(to_py)?;
+    let thinned = in_pool(py, num_threads, timeout_s, |interrupt| {
+        features::voxel_downsample(&points, normals.as_deref(), voxel, interrupt)
+    })?;
     let normals = thinned.normals.map(|normals| vectors(py, normals)).transpose()?;
     Ok((vectors(py, thinned.points.into_iter().map(|p| p.coords).collect())?, normals))
 }
 
 #[pyfunction]
+#[pyo3(signature = (points, radius, max_neighbors, viewpoint, num_threads, timeout_s=None))]
+#[allow(clippy::too_many_arguments)] // Python's keyword arguments
 fn features_estimate_normals<'py>(
     py: Python<'py>,
     points: Rows<'py>,
@@ -54,17 +61,20 @@ fn features_estimate_normals<'py>(
     max_neighbors: usize,
     viewpoint: Option<[f64; 3]>,
     num_threads: Option<usize>,
+    timeout_s: Option<f64>,
 ) -> PyResult<Floats<'py>> {
     let points = rows3(&points, Point3::new)?;
     let neighborhood = Neighborhood { radius, max_neighbors };
     let viewpoint = viewpoint.map(Point3::from);
-    let normals = in_pool(py, num_threads, |interrupt| {
+    let normals = in_pool(py, num_threads, timeout_s, |interrupt| {
         features::estimate_normals(&points, neighborhood, viewpoint, interrupt)
     })?;
     vectors(py, normals)
 }
 
 #[pyfunction]
+#[pyo3(signature = (points, normals, radius, max_neighbors, keypoints, num_threads, timeout_s=None))]
+#[allow(clippy::too_many_arguments)] // Python's keyword arguments
 fn features_fpfh<'py>(
     py: Python<'py>,
     points: Rows<'py>,
@@ -73,11 +83,12 @@ fn features_fpfh<'py>(
     max_neighbors: usize,
     keypoints: Option<PyReadonlyArray1<'py, i64>>,
     num_threads: Option<usize>,
+    timeout_s: Option<f64>,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let (points, normals) = (rows3(&points, Point3::new)?, rows3(&normals, Vector3::new)?);
     let neighborhood = Neighborhood { radius, max_neighbors };
     let keypoints = keypoints.map(|rows| keypoint_rows(&rows, points.len())).transpose()?;
-    let descriptors = in_pool(py, num_threads, |interrupt| {
+    let descriptors = in_pool(py, num_threads, timeout_s, |interrupt| {
         features::fpfh(&points, &normals, neighborhood, keypoints.as_deref(), interrupt)
     })?;
     let rows = descriptors.len();
@@ -98,6 +109,8 @@ fn keypoint_rows(rows: &PyReadonlyArray1<'_, i64>, len: usize) -> PyResult<Vec<u
 type Pairs<'py> = (Bound<'py, PyArray2<i64>>, Bound<'py, PyArray1<f64>>);
 
 #[pyfunction]
+#[pyo3(signature = (src_feat, tgt_feat, k, mutual, ratio, num_threads, timeout_s=None))]
+#[allow(clippy::too_many_arguments)] // Python's keyword arguments
 fn features_match<'py>(
     py: Python<'py>,
     src_feat: PyReadonlyArray2<'py, f32>,
@@ -106,6 +119,7 @@ fn features_match<'py>(
     mutual: bool,
     ratio: Option<f64>,
     num_threads: Option<usize>,
+    timeout_s: Option<f64>,
 ) -> PyResult<Pairs<'py>> {
     let own = |array: &PyReadonlyArray2<'_, f32>| {
         let array = array.as_array();
@@ -116,7 +130,7 @@ fn features_match<'py>(
         return Err(InputError::new_err("descriptors must have at least 1 column"));
     }
     let matching = Matching { k, mutual, max_ratio: ratio };
-    let matches = in_pool(py, num_threads, |interrupt| {
+    let matches = in_pool(py, num_threads, timeout_s, |interrupt| {
         let [src, tgt] = [&src, &tgt].map(|(values, dim)| Descriptors { values, dim: *dim });
         features::match_features(src, tgt, matching, interrupt)
     })?;
@@ -129,6 +143,8 @@ fn features_match<'py>(
 type Plane<'py> = ([f64; 3], f64, Bound<'py, PyArray1<bool>>, f64);
 
 #[pyfunction]
+#[pyo3(signature = (points, distance, min_share, viewpoint, seed, num_threads, timeout_s=None))]
+#[allow(clippy::too_many_arguments)] // Python's keyword arguments
 fn features_dominant_plane<'py>(
     py: Python<'py>,
     points: Rows<'py>,
@@ -137,11 +153,12 @@ fn features_dominant_plane<'py>(
     viewpoint: Option<[f64; 3]>,
     seed: u64,
     num_threads: Option<usize>,
+    timeout_s: Option<f64>,
 ) -> PyResult<Option<Plane<'py>>> {
     let points = rows3(&points, Point3::new)?;
     let search = PlaneSearch { distance, min_share, seed };
     let viewpoint = viewpoint.map(Point3::from);
-    let plane = in_pool(py, num_threads, |interrupt| {
+    let plane = in_pool(py, num_threads, timeout_s, |interrupt| {
         features::dominant_plane(&points, &search, viewpoint, interrupt)
     })?;
     Ok(plane.map(|p| (p.normal.into(), p.offset, p.inliers.into_pyarray(py), p.behind)))
@@ -159,7 +176,8 @@ fn features_sample_mesh<'py>(
     let (vertices, faces) = mesh(&vertices, &faces)?;
     let mesh = Mesh { vertices: &vertices, faces: &faces };
     let amount = count.map_or(Amount::Spacing(spacing), Amount::Count);
-    let sampled = in_pool(py, Some(1), |interrupt| features::sample_mesh(&mesh, amount, seed, interrupt))?;
+    let sampled =
+        in_pool(py, Some(1), None, |interrupt| features::sample_mesh(&mesh, amount, seed, interrupt))?;
     let points = sampled.points.into_iter().map(|p| p.coords).collect();
     Ok((vectors(py, points)?, vectors(py, sampled.normals)?))
 }
@@ -181,7 +199,7 @@ fn features_outer_surface<'py>(
     let (vertices, faces) = mesh(&vertices, &faces)?;
     let mesh = Mesh { vertices: &vertices, faces: &faces };
     let views = Views { count: num_views, max_angle_rad, lift };
-    let is_outer = in_pool(py, num_threads, |interrupt| {
+    let is_outer = in_pool(py, num_threads, None, |interrupt| {
         features::outer_surface(&points, &normals, &mesh, &views, interrupt)
     })?;
     Ok(is_outer.into_pyarray(py))
@@ -204,15 +222,16 @@ fn mesh(vertices: &Rows<'_>, faces: &PyReadonlyArray2<'_, i64>) -> PyResult<Corn
     Ok((vertices, faces?))
 }
 
-/// Runs `job` on threads of its own, where Ctrl-C reaches it.
+/// Runs `job` on threads of its own, where Ctrl-C reaches it; with `timeout_s` a `TimeoutError` says that time has run out.
 fn in_pool<T: Send>(
     py: Python<'_>,
     num_threads: Option<usize>,
+    timeout_s: Option<f64>,
     job: impl FnOnce(&Interrupt) -> Result<T, FeatureError> + Send,
 ) -> PyResult<T> {
-    in_background(py, |cancel, _| {
-        let pool = Pool::new(num_threads).map_err(|error| to_py_err(&error))?;
-        pool.install(|| job(&watched(Interrupt::from(cancel)))).map_err(to_py)
+    let start = Instant::now();
+    register::in_pool(py, num_threads, |interrupt| {
+        job(&interrupt.clone().with_timeout(start, timeout_s)).map_err(to_py)
     })
 }
 
@@ -223,5 +242,11 @@ fn vectors(py: Python<'_>, rows: Vec<Vector3<f64>>) -> PyResult<Floats<'_>> {
 }
 
 fn to_py(error: FeatureError) -> PyErr {
-    InputError::new_err(error.to_string())
+    let message = error.to_string();
+    // Of a signal nobody sees it: that is raised first.
+    if error == FeatureError::Interrupted {
+        PyTimeoutError::new_err(message)
+    } else {
+        InputError::new_err(message)
+    }
 }

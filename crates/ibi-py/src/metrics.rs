@@ -6,6 +6,7 @@
 // pyo3 hands arguments over by value; a read-only array is a handle, cheap to own.
 #![expect(clippy::needless_pass_by_value)]
 
+use ibi_core::Interrupt;
 use ibi_core::metrics::{
     self, Criterion, Matching, MetricsError, Model, PoseThresholds, SceneScore, rotation_error_rad,
     translation_error,
@@ -16,6 +17,7 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
+use crate::register;
 use crate::symmetries::Symmetries;
 
 /// How far from a rotation a matrix may be, per entry of R^T R: the rounding of single precision passes, a
@@ -80,10 +82,18 @@ fn metrics_add(py: Python<'_>, model: Points<'_>, predicted: Pose<'_>, truth: Po
 }
 
 #[pyfunction]
-fn metrics_add_s(py: Python<'_>, model: Points<'_>, predicted: Pose<'_>, truth: Pose<'_>) -> PyResult<f64> {
+fn metrics_add_s(
+    py: Python<'_>,
+    model: Points<'_>,
+    predicted: Pose<'_>,
+    truth: Pose<'_>,
+    num_threads: Option<usize>,
+) -> PyResult<f64> {
     let (points, predicted, truth) =
         (points("model", &model)?, pose("predicted", &predicted)?, pose("truth", &truth)?);
-    py.detach(|| Ok(Model::new(points)?.add_s(&predicted, &truth))).map_err(to_py)
+    in_pool(py, num_threads, points.len(), |interrupt| {
+        Model::new(points)?.add_s(&predicted, &truth, interrupt)
+    })
 }
 
 #[pyfunction]
@@ -96,13 +106,15 @@ fn metrics_mssd(
 ) -> PyResult<f64> {
     let (points, predicted, truth) =
         (points("model", &model)?, pose("predicted", &predicted)?, pose("truth", &truth)?);
-    py.detach(|| Ok(Model::new(points)?.mssd(&predicted, &truth, &symmetries.0))).map_err(to_py)
+    in_pool(py, Some(1), 0, |interrupt| {
+        Model::new(points)?.mssd(&predicted, &truth, &symmetries.0, interrupt)
+    })
 }
 
 #[pyfunction]
-fn metrics_diameter(py: Python<'_>, points: Points<'_>) -> PyResult<f64> {
+fn metrics_diameter(py: Python<'_>, points: Points<'_>, num_threads: Option<usize>) -> PyResult<f64> {
     let points = self::points("points", &points)?;
-    Ok(py.detach(|| metrics::diameter(&points)))
+    in_pool(py, num_threads, points.len(), |interrupt| metrics::diameter(&points, interrupt))
 }
 
 /// One column per row, -1 for a row left over.
@@ -117,11 +129,12 @@ fn metrics_assignment<'py>(
     if let Some(cell) = cost.iter().position(|x| !x.is_finite()) {
         return Err(value_error(format!("cost[{}, {}] must be finite", cell / cols, cell % cols)));
     }
-    let columns = py.detach(|| metrics::assignment(&cost, rows, cols));
+    let columns = in_pool(py, Some(1), 0, |interrupt| metrics::assignment(&cost, rows, cols, interrupt))?;
     Ok(columns.into_iter().map(row_or_minus_one).collect::<Vec<_>>().into_pyarray(py))
 }
 
 #[pyfunction]
+#[allow(clippy::too_many_arguments)] // Python's keyword arguments
 fn metrics_score_pose<'py>(
     py: Python<'py>,
     predicted: Poses<'py>,
@@ -130,16 +143,19 @@ fn metrics_score_pose<'py>(
     rotation_rad: f64,
     translation: f64,
     symmetries: &Symmetries,
+    num_threads: Option<usize>,
 ) -> PyResult<Scored<'py>> {
     let (predicted, truth) = (poses("predicted", &predicted)?, poses("truth", &truth)?);
     let matching = self::matching(matching)?;
     let criterion = Criterion::Pose(PoseThresholds { rotation_rad, translation });
-    let score =
-        py.detach(|| metrics::score_scene_modulo(&predicted, &truth, matching, &criterion, &symmetries.0));
+    let score = in_pool(py, num_threads, predicted.len() * truth.len(), |interrupt| {
+        metrics::score_scene_modulo(&predicted, &truth, matching, &criterion, &symmetries.0, interrupt)
+    })?;
     Ok(scored(py, &score))
 }
 
 #[pyfunction]
+#[allow(clippy::too_many_arguments)] // Python's keyword arguments
 fn metrics_score_add_s<'py>(
     py: Python<'py>,
     predicted: Poses<'py>,
@@ -148,15 +164,17 @@ fn metrics_score_add_s<'py>(
     model: Points<'py>,
     diameter_fraction: f64,
     symmetries: &Symmetries,
+    num_threads: Option<usize>,
 ) -> PyResult<Scored<'py>> {
     let (predicted, truth) = (poses("predicted", &predicted)?, poses("truth", &truth)?);
     let (points, matching) = (points("model", &model)?, self::matching(matching)?);
-    let score = py.detach(|| {
+    let work = predicted.len() * truth.len() * points.len();
+    let score = in_pool(py, num_threads, work, |interrupt| {
         let model = Model::new(points)?;
         let criterion = Criterion::AddS { model: &model, diameter_fraction };
-        Ok(metrics::score_scene_modulo(&predicted, &truth, matching, &criterion, &symmetries.0))
-    });
-    Ok(scored(py, &score.map_err(to_py)?))
+        metrics::score_scene_modulo(&predicted, &truth, matching, &criterion, &symmetries.0, interrupt)
+    })?;
+    Ok(scored(py, &score))
 }
 
 /// The average recall, and the recall at each part of the diameter.
@@ -168,14 +186,15 @@ fn metrics_mssd_recall<'py>(
     matching: &str,
     model: Points<'py>,
     symmetries: &Symmetries,
+    num_threads: Option<usize>,
 ) -> PyResult<(f64, Bound<'py, PyArray1<f64>>)> {
     let (predicted, truth) = (poses("predicted", &predicted)?, poses("truth", &truth)?);
     let (points, matching) = (points("model", &model)?, self::matching(matching)?);
-    let found = py
-        .detach(|| {
-            Ok(metrics::mssd_recall(&Model::new(points)?, &predicted, &truth, &symmetries.0, matching))
-        })
-        .map_err(to_py)?;
+    let work = predicted.len() * truth.len() * points.len();
+    let found = in_pool(py, num_threads, work, |interrupt| {
+        let model = Model::new(points)?;
+        metrics::mssd_recall(&model, &predicted, &truth, &symmetries.0, matching, interrupt)
+    })?;
     Ok((found.average, found.recalls.to_vec().into_pyarray(py)))
 }
 
@@ -283,6 +302,20 @@ pub(crate) fn rigid_motion(
     let translation = Vector3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)]);
     let quaternion = UnitQuaternion::new_normalize(quaternion.into_inner());
     Ok(Isometry3::from_parts(translation.into(), quaternion))
+}
+
+/// Less work, in points looked at, is not worth a second thread.
+const LITTLE: usize = 10_000;
+
+/// Runs `job` on threads of its own, where Ctrl-C reaches it.
+fn in_pool<T: Send>(
+    py: Python<'_>,
+    num_threads: Option<usize>,
+    work: usize,
+    job: impl FnOnce(&Interrupt) -> Result<T, MetricsError> + Send,
+) -> PyResult<T> {
+    let num_threads = if work < LITTLE { Some(1) } else { num_threads };
+    register::in_pool(py, num_threads, |interrupt| job(interrupt).map_err(to_py))
 }
 
 fn to_py(error: MetricsError) -> PyErr {

@@ -5,8 +5,11 @@ use std::sync::Arc;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
+use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Matrix3, Point3, Vector3};
-use ibi_core::{CancelToken, Cloud, Correspondences, PreparedCloud, Registrar, Registration, Round};
+use ibi_core::{
+    CancelToken, Cloud, Correspondences, Interrupt, PreparedCloud, Registrar, Registration, Round,
+};
 use numpy::ndarray::ArrayView2;
 use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::{PySystemExit, PyValueError};
@@ -57,8 +60,9 @@ impl Source {
     }
 
     #[getter]
-    fn diameter(&self, py: Python<'_>) -> f64 {
-        py.detach(|| self.0.diameter())
+    fn diameter(&self, py: Python<'_>) -> PyResult<f64> {
+        // Interrupted by a signal alone, which is then raised.
+        in_pool(py, None, |interrupt| Ok(self.0.diameter(interrupt).unwrap_or(f64::NAN)))
     }
 }
 
@@ -174,6 +178,18 @@ impl Caller {
         }
         answer
     }
+}
+
+/// Runs `job` in the background, on so many threads of its own; by default as many as the process may use.
+pub(crate) fn in_pool<T: Send>(
+    py: Python<'_>,
+    num_threads: Option<usize>,
+    job: impl FnOnce(&Interrupt) -> PyResult<T> + Send,
+) -> PyResult<T> {
+    in_background(py, |cancel, _| {
+        let pool = Pool::new(num_threads).map_err(|error| to_py_err(&error))?;
+        pool.install(|| job(&runs::watched(cancel)))
+    })
 }
 
 /// Runs `job` on a thread of its own with the GIL released, while this one, which alone may see signals, looks

@@ -134,8 +134,9 @@ pub(crate) fn watcher() -> Option<Watcher> {
     WATCHER.read().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
-/// With that watcher, if there is one.
-pub(crate) fn watched(interrupt: Interrupt) -> Interrupt {
+/// What a computation asks that `cancel` ends, with that watcher if there is one.
+pub(crate) fn watched(cancel: CancelToken) -> Interrupt {
+    let interrupt = Interrupt::from(cancel);
     match watcher() {
         Some(watcher) => interrupt.with_watcher(watcher),
         None => interrupt,

@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 
 use crate::InputError;
 use crate::metrics::{Pose, Poses, pose, poses};
-use crate::register::{in_background, rows3};
+use crate::register::{in_pool, rows3};
 
 /// Adds the contents of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -85,8 +85,8 @@ fn symmetries_find(
 ) -> PyResult<Symmetries> {
     let points = rows3(&points, Point3::new)?;
     let normals = normals.map(|normals| rows3(&normals, Vector3::new)).transpose()?;
-    let found = in_background(py, |_, _| {
-        find_symmetries(&points, normals.as_deref(), FindSymmetries { tolerance }).map_err(to_py)
+    let found = in_pool(py, Some(1), |interrupt| {
+        find_symmetries(&points, normals.as_deref(), FindSymmetries { tolerance }, interrupt).map_err(to_py)
     })?;
     Ok(Symmetries(found))
 }

@@ -14,6 +14,7 @@ use crate::kernels::columns::{columns, middle};
 use crate::kernels::grid::Grid;
 use crate::kernels::par;
 use crate::kernels::simd::simd;
+use crate::pace::Pace;
 
 /// Which points count as the neighbours of a point (Open3D's hybrid search): the nearest `max_neighbors` nearer than
 /// `radius`. The point itself is one of them.
@@ -42,6 +43,9 @@ const LANES: usize = 8;
 /// Points that one thread takes at a time.
 const GRAIN: usize = 256;
 
+/// The same where a step is a look into memory.
+const GATHER: usize = 1 << 14;
+
 /// Cells for each radius. Smaller ones fit the ball better and are more to walk through.
 const CELLS_PER_RADIUS: f64 = 1.5;
 
@@ -63,6 +67,8 @@ pub(super) struct Others {
     place: Vec<u32>,
     dist_sq: Vec<f64>,
     len: usize,
+    /// Among so many points they were found.
+    looked_at: usize,
     radius_sq: f64,
     /// Those among which the cut falls.
     doubtful: Vec<(f64, u32, u32)>,
@@ -89,20 +95,29 @@ impl Others {
 }
 
 impl Around {
-    pub(super) fn new(points: &[Point3<f64>], neighborhood: Neighborhood) -> Self {
+    pub(super) fn new(
+        points: &[Point3<f64>],
+        neighborhood: Neighborhood,
+        interrupt: &Interrupt,
+    ) -> Result<Self, FeatureError> {
+        // Each step takes tens of milliseconds for millions of points.
+        let proceed = || if interrupt.is_set() { Err(FeatureError::Interrupted) } else { Ok(()) };
         let rows = columns(points, middle(points), neighborhood.radius);
+        proceed()?;
         let grid = Grid::new(&rows, (1.0 / CELLS_PER_RADIUS) as f32);
-        let sorted: Vec<[f64; 3]> =
-            grid.order().iter().map(|&row| points[row as usize].coords.into()).collect();
+        proceed()?;
+        let order = grid.order();
+        let sorted = par::chunks(order.len(), GATHER, |run| {
+            order[run].iter().map(|&row| points[row as usize].coords.into()).collect::<Vec<[f64; 3]>>()
+        });
+        let sorted = sorted.concat();
+        proceed()?;
         let far = [f64::INFINITY; LANES];
+        let columns = [0, 1, 2].map(|axis| sorted.iter().map(|p| p[axis]).chain(far).collect());
+        proceed()?;
         let local = |&row: &u32| rows.each_ref().map(|axis| axis[row as usize]);
-        Self {
-            points: [0, 1, 2].map(|axis| sorted.iter().map(|p| p[axis]).chain(far).collect()),
-            local: grid.order().iter().map(local).collect(),
-            rows: sorted,
-            grid,
-            neighborhood,
-        }
+        let local = par::chunks(order.len(), GATHER, |run| order[run].iter().map(local).collect::<Vec<_>>());
+        Ok(Self { points: columns, local: local.concat(), rows: sorted, grid, neighborhood })
     }
 
     /// The rows of the cloud by place.
@@ -134,6 +149,7 @@ impl Around {
                 return Vec::new();
             }
             let (mut others, mut scratch) = (Others::default(), S::default());
+            let mut pace = Pace::new(interrupt);
             let places = &places[run];
             let mut answers = Vec::with_capacity(places.len());
             // A loop: `collect` would not be seen through, and so not be compiled for the vector units.
@@ -142,6 +158,10 @@ impl Around {
                 || {
                     for &place in places {
                         self.find(place as usize, &mut others);
+                        // A neighbourhood may be all of the cloud.
+                        if pace.is_over(others.looked_at) {
+                            return;
+                        }
                         answers.push(each(place as usize, &others, &mut scratch));
                     }
                 },
@@ -158,7 +178,7 @@ impl Around {
     #[inline(always)]
     #[allow(clippy::inline_always)] // the body of the loop above
     fn find(&self, place: usize, others: &mut Others) {
-        others.len = 0;
+        (others.len, others.looked_at) = (0, 0);
         others.radius_sq = self.neighborhood.radius * self.neighborhood.radius;
         self.grid.each_around(
             self.local[place],
@@ -175,6 +195,7 @@ impl Around {
     #[inline(always)]
     #[allow(clippy::inline_always, clippy::needless_bitwise_bool)] // an inner loop without branches
     fn look(&self, place: usize, run: Range<usize>, others: &mut Others) {
+        others.looked_at += run.len();
         let room = others.len + run.len() + LANES;
         if others.place.len() < room {
             others.place.resize(2 * room, 0);

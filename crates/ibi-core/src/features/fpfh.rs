@@ -6,7 +6,7 @@ use super::FeatureError;
 use super::around::{Around, Neighborhood, Others};
 use super::door::{check_len, check_points, unit_normals};
 use super::pairs::{Pairs, SECTORS};
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 
 /// Numbers of a descriptor: three histograms.
 pub const FPFH_DIM: usize = 3 * SECTORS;
@@ -24,7 +24,8 @@ const MAX_WEIGHT: f64 = 1e30;
 ///
 /// As Open3D's `compute_fpfh_feature` has it: eleven bins for each of the three angles, neighbours weighted by the
 /// inverse of their squared distance, each mean of histograms scaled to 100 and the point's own histogram added. A
-/// point without neighbours gets zeros. Normals are brought to length 1, which Open3D takes for granted.
+/// point without neighbours gets zeros, and so the sum of a histogram is 200 or 0; it is 100 for a point whose neighbours are
+/// all at its own place, and so have no weight. Normals are brought to length 1, which Open3D takes for granted.
 ///
 /// # Errors
 /// If a coordinate is not finite, if there is not one normal of some length for each point, if the radius is not above
@@ -43,7 +44,10 @@ pub fn fpfh(
     let normals = unit_normals("normals", normals, points.len())?;
     neighborhood.check(2, "at least 2, the point itself among them")?;
     check_keypoints(keypoints.unwrap_or_default(), points.len())?;
-    let around = Around::new(points, neighborhood);
+    if !interrupt.enter(Phase::Fpfh) {
+        return Err(FeatureError::Interrupted);
+    }
+    let around = Around::new(points, neighborhood, interrupt)?;
     let n = points.len();
     let order = around.order();
     let normals: Vec<[f32; 3]> = order.iter().map(|&row| normals[row as usize].cast().into()).collect();
@@ -130,7 +134,7 @@ fn spfh(around: &Around, normals: &[[f32; 3]], place: usize, others: &Others, pa
     let mut histogram = [0.0; WIDTH];
     let share = 100.0 / others.places().len().max(1) as f32;
     for (value, count) in histogram.iter_mut().zip(counts.as_flattened()) {
-        *value = f32::from(*count) * share;
+        *value = *count as f32 * share;
     }
     histogram
 }

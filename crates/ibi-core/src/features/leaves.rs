@@ -8,10 +8,14 @@ use std::ops::Range;
 
 use super::{Descriptors, FeatureError};
 use crate::interrupt::Interrupt;
+use crate::kernels::par;
 use crate::kernels::simd::simd;
 
 /// Rows of a leaf, and what is treated side by side.
 const LANES: usize = 16;
+
+/// No more rows than this are sorted by one thread alone.
+const SERIAL: usize = 4096;
 
 /// Sixteen columns side by side, a vector for each dimension.
 type Block = Vec<[f32; LANES]>;
@@ -237,9 +241,16 @@ fn split(rows: &Descriptors<'_>, order: &mut [u32], interrupt: &Interrupt) {
     let half = (order.len().div_ceil(LANES) / 2) * LANES;
     let value = |row: u32| rows.row(row)[axis];
     order.select_nth_unstable_by(half, |&a, &b| value(a).total_cmp(&value(b)).then(a.cmp(&b)));
+    let is_large = order.len() > SERIAL;
     let (low, high) = order.split_at_mut(half);
-    split(rows, low, interrupt);
-    split(rows, high, interrupt);
+    let mut low = || split(rows, low, interrupt);
+    let mut high = || split(rows, high, interrupt);
+    if is_large {
+        par::join(low, high);
+    } else {
+        low();
+        high();
+    }
 }
 
 /// The dimension of the largest variance.

@@ -3,7 +3,7 @@
 use super::FeatureError;
 use super::door::check_len;
 use super::leaves::Leaves;
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::par;
 
 /// Descriptors of any kind, a row for each point.
@@ -103,6 +103,9 @@ pub fn match_features(
         && !(value > 0.0 && value <= 1.0)
     {
         return Err(FeatureError::Setting { argument: "ratio", value, allowed: "above 0 and at most 1" });
+    }
+    if !interrupt.enter(Phase::Match) {
+        return Err(FeatureError::Interrupted);
     }
     let back = if mutual { Some(nearest_rows(target, source, k, interrupt)?) } else { None };
     let leaves = Leaves::new(source, interrupt)?;

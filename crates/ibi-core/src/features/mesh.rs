@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::FeatureError;
 use super::door::{check_len, check_length, check_points};
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::rng::Rng;
 
 /// A surface of triangles. Seen from outside, the corners of a face run counter-clockwise: that is where its normal
@@ -91,6 +91,9 @@ pub fn sample_mesh(
     if let Amount::Spacing(spacing) = amount {
         check_length("spacing", spacing)?;
     }
+    if !interrupt.enter(Phase::SampleMesh) {
+        return Err(FeatureError::Interrupted);
+    }
     let surface = Surface::new(mesh).ok_or(FeatureError::NoArea)?;
     let (count, spacing) = match amount {
         // The nodes of a lattice of triangles are the farthest apart.
@@ -112,7 +115,8 @@ pub fn sample_mesh(
             if is_full(&kept) {
                 break;
             }
-            if draw % 1024 == 0 && interrupt.is_set() {
+            // Where all points share a few cells, a draw looks at all of them.
+            if draw % 16 == 0 && interrupt.is_set() {
                 return Err(FeatureError::Interrupted);
             }
             let (point, normal) = surface.draw(&mut rng);
@@ -181,6 +185,7 @@ impl Kept {
         Self { sampled: Sampled::default(), inv_cell: 1.0 / cell, origin, last, before: Vec::new() }
     }
 
+    /// Coordinates beyond what 64 bits can count share the last cells.
     fn cell(&self, point: &Point3<f64>) -> [i64; 3] {
         [0, 1, 2].map(|axis| ((point[axis] - self.origin[axis]) * self.inv_cell).floor() as i64)
     }
@@ -207,7 +212,11 @@ impl Kept {
             }
             true
         };
-        (-1..=1).all(|i| (-1..=1).all(|j| (-1..=1).all(|k| is_free([x + i, y + j, z + k]))))
+        (-1..=1).all(|i| {
+            (-1..=1).all(|j| {
+                (-1..=1).all(|k| is_free([x.saturating_add(i), y.saturating_add(j), z.saturating_add(k)]))
+            })
+        })
     }
 
     fn push(&mut self, point: Point3<f64>, normal: Vector3<f64>) {

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use super::FeatureError;
 use super::around::{Around, Neighborhood, Others};
 use super::door::{check_place, check_points};
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 
 /// The normal of each point: across the plane through its neighbours, by PCA (Hoppe et al. 1992).
 ///
@@ -27,7 +27,10 @@ pub fn estimate_normals(
     check_points("points", points)?;
     check_place("viewpoint", viewpoint.as_ref())?;
     neighborhood.check(3, "at least 3, the point itself among them")?;
-    let around = Around::new(points, neighborhood);
+    if !interrupt.enter(Phase::Normals) {
+        return Err(FeatureError::Interrupted);
+    }
+    let around = Around::new(points, neighborhood, interrupt)?;
     let places: Vec<u32> = (0..points.len() as u32).collect();
     let sorted = around.map(
         &places,
@@ -75,7 +78,7 @@ fn normal(around: &Around, place: usize, others: &Others, to_eye: Option<Vector3
 ///
 /// The roots of the characteristic polynomial in closed form (Smith 1961). Where the two least are nearly one, as for
 /// points on a line, it loses digits, and the iteration takes over: ten times as slow.
-pub(super) fn least_axis(spread: &Matrix3<f64>) -> Option<Vector3<f64>> {
+pub(crate) fn least_axis(spread: &Matrix3<f64>) -> Option<Vector3<f64>> {
     let size = spread.amax();
     if size <= 0.0 {
         return None;

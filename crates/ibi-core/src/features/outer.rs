@@ -10,10 +10,11 @@ use nalgebra::{Point3, Vector3};
 use super::FeatureError;
 use super::door::{check_points, unit_normals};
 use super::mesh::Mesh;
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::grid::buckets;
 use crate::kernels::par;
-use crate::kernels::sight::{across, corners, direction};
+use crate::kernels::sight::{across, direction};
+use crate::pace::Pace;
 
 /// From where the part is looked at.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -35,6 +36,9 @@ impl Default for Views {
 
 /// Points that one thread takes at a time.
 const GRAIN: usize = 256;
+
+/// Directions that are looked from at the same time.
+const AT_ONCE: usize = 4;
 
 /// Which of the points on a mesh are seen from outside, from one of the directions at least: a ray from there meets no
 /// face before.
@@ -60,21 +64,32 @@ pub fn outer_surface(
     let (low, high) = bounds(mesh.vertices);
     let size = (high - low).norm();
     let lift = views.check(size)?;
+    if !interrupt.enter(Phase::OuterSurface) {
+        return Err(FeatureError::Interrupted);
+    }
     let cos = views.max_angle_rad.cos();
     let mut is_seen = vec![false; points.len()];
-    for view in 0..views.count {
+    // Side by side, although one of them may look again at what another one sees.
+    let at_once = if par::is_parallel() { AT_ONCE } else { 1 };
+    for first in (0..views.count).step_by(at_once) {
+        let seen = par::map(at_once.min(views.count - first), 1, |i| {
+            let to_eye = direction(first + i, views.count);
+            let facing = |&row: &usize| !is_seen[row] && normals[row].dot(&to_eye) >= cos;
+            let rows: Vec<usize> = (0..points.len()).filter(facing).collect();
+            let lifted = |&row: &usize| points[row] + lift * normals[row];
+            let asked: Vec<Point3<f64>> = rows.iter().map(lifted).collect();
+            let screen = Screen::new(mesh, low, to_eye, 1e-9 * size, &asked, interrupt);
+            let seen = par::chunks(rows.len(), GRAIN, |run| {
+                let is_asked = !interrupt.is_set();
+                let sees = |&at: &usize| is_asked && screen.sees(&asked[at]);
+                run.filter(sees).map(|at| rows[at]).collect::<Vec<_>>()
+            });
+            seen.concat()
+        });
         if interrupt.is_set() {
             return Err(FeatureError::Interrupted);
         }
-        let to_eye = direction(view, views.count);
-        let facing = |&row: &usize| !is_seen[row] && normals[row].dot(&to_eye) >= cos;
-        let rows: Vec<usize> = (0..points.len()).filter(facing).collect();
-        if rows.is_empty() {
-            continue;
-        }
-        let screen = Screen::new(mesh, low, to_eye, 1e-9 * size);
-        let seen = par::map(rows.len(), GRAIN, |i| screen.sees(points[rows[i]] + lift * normals[rows[i]]));
-        rows.iter().zip(seen).for_each(|(&row, seen)| is_seen[row] = seen);
+        seen.into_iter().flatten().for_each(|row| is_seen[row] = true);
     }
     Ok(is_seen)
 }
@@ -102,13 +117,14 @@ fn bounds(points: &[Point3<f64>]) -> (Point3<f64>, Point3<f64>) {
     points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)))
 }
 
-/// The mesh as seen from one direction: the faces that each pixel shows.
-struct Screen {
+/// The mesh as seen from one direction: the faces that each pixel shows, where somebody asks.
+struct Screen<'a> {
+    mesh: &'a Mesh<'a>,
     /// Right, up and towards the eye.
     axes: [Vector3<f64>; 3],
     origin: Point3<f64>,
-    /// The corners of each face on the screen.
-    faces: Vec<[[f64; 3]; 3]>,
+    /// On the screen.
+    vertices: Vec<[f64; 3]>,
     low: [f64; 2],
     inv_pixel: f64,
     shape: [usize; 2],
@@ -122,48 +138,133 @@ struct Screen {
 /// Pixels on a side at most.
 const MAX_SIDE: usize = 512;
 
-impl Screen {
-    fn new(mesh: &Mesh<'_>, origin: Point3<f64>, to_eye: Vector3<f64>, rounding: f64) -> Self {
+/// A face across more columns of pixels is followed from column to column: the box around a long and thin one is full of
+/// pixels that do not show it.
+const WIDE: usize = 4;
+
+impl<'a> Screen<'a> {
+    /// For questions about the points `asked`. Less than all if interrupted.
+    fn new(
+        mesh: &'a Mesh<'a>,
+        origin: Point3<f64>,
+        to_eye: Vector3<f64>,
+        rounding: f64,
+        asked: &[Point3<f64>],
+        interrupt: &Interrupt,
+    ) -> Self {
         let [right, up] = across(&to_eye);
         let axes = [right, up, to_eye];
-        let vertices: Vec<[f64; 3]> = mesh.vertices.iter().map(|v| on_screen(&axes, origin, v)).collect();
-        let faces: Vec<_> = mesh.faces.iter().map(|face| face.map(|vertex| vertices[vertex])).collect();
-        let flat: Vec<[f64; 2]> = vertices.iter().map(|&[x, y, _]| [x, y]).collect();
-        let ([left, bottom], [right, top]) = corners(&flat);
+        let mut pace = Pace::new(interrupt);
+        let vertices = mesh.vertices.iter().take_while(|_| !asked.is_empty() && !pace.is_over(2));
+        let vertices: Vec<[f64; 3]> = vertices.map(|v| on_screen(&axes, origin, v)).collect();
+        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for at in &vertices {
+            for k in 0..2 {
+                (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k]));
+            }
+        }
         // About as many pixels as faces.
-        let side = ((faces.len() as f64).sqrt() as usize).clamp(8, MAX_SIDE);
-        let pixel = ((right - left).max(top - bottom) / side as f64).max(f64::MIN_POSITIVE);
+        let side = ((mesh.faces.len() as f64).sqrt() as usize).clamp(8, MAX_SIDE);
+        let [width, height] = [0, 1].map(|k| high[k] - low[k]);
+        let pixel = (width.max(height) / side as f64).max(f64::MIN_POSITIVE);
         let mut screen = Self {
+            mesh,
             axes,
             origin,
-            low: [left, bottom],
+            low,
             inv_pixel: 1.0 / pixel,
-            shape: [right - left, top - bottom].map(|width| ((width / pixel) as usize + 1).min(side + 1)),
+            shape: [width, height].map(|width| ((width / pixel) as usize + 1).min(side + 1)),
             starts: Vec::new(),
             shown: Vec::new(),
-            faces,
+            vertices,
             rounding,
         };
-        screen.show();
+        if screen.vertices.len() == mesh.vertices.len() {
+            screen.show(asked, &mut pace);
+        }
         screen
     }
 
-    /// Sorts the faces by the pixels that they may cover.
-    fn show(&mut self) {
-        let faces = (0..).zip(&self.faces);
-        let covered = faces.flat_map(|(id, face)| self.pixels(face).map(move |pixel| (id, pixel)));
-        (self.starts, self.shown) = buckets(self.shape[0] * self.shape[1], covered);
+    /// Sorts the faces by the pixels that they may cover: those that lie before a point that is asked for.
+    fn show(&mut self, asked: &[Point3<f64>], pace: &mut Pace<'_>) {
+        let mut deepest = vec![f64::INFINITY; self.shape[0] * self.shape[1]];
+        for point in asked {
+            let p = on_screen(&self.axes, self.origin, point);
+            let pixel = self.pixel(&p);
+            deepest[pixel] = deepest[pixel].min(p[2]);
+        }
+        let mut shown: Vec<(u32, usize)> = Vec::new();
+        for id in 0..self.mesh.faces.len() {
+            let face = self.corners(id);
+            let nearest = face[0][2].max(face[1][2]).max(face[2][2]);
+            let num_before = shown.len();
+            let num_looked_at = self.each_pixel(&face, |pixel| {
+                if deepest[pixel] < nearest {
+                    shown.push((id as u32, pixel));
+                }
+            });
+            if pace.is_over(4 + num_looked_at + shown.len() - num_before) {
+                return;
+            }
+        }
+        (self.starts, self.shown) = buckets(deepest.len(), shown.iter().copied());
     }
 
-    /// The pixels of the box around a face.
-    fn pixels(&self, face: &[[f64; 3]; 3]) -> impl Iterator<Item = usize> + Clone + use<> {
-        let range = |k: usize| {
-            let (low, high) =
-                (face[0][k].min(face[1][k]).min(face[2][k]), face[0][k].max(face[1][k]).max(face[2][k]));
-            self.along(k, low - self.rounding)..=self.along(k, high + self.rounding)
+    fn corners(&self, face: usize) -> [[f64; 3]; 3] {
+        self.mesh.faces[face].map(|vertex| self.vertices[vertex])
+    }
+
+    /// Tells `look` all pixels that a face may cover, and others; returns how many.
+    fn each_pixel(&self, face: &[[f64; 3]; 3], mut look: impl FnMut(usize)) -> usize {
+        let bounds = |k: usize| {
+            let low = face[0][k].min(face[1][k]).min(face[2][k]) - self.rounding;
+            let high = face[0][k].max(face[1][k]).max(face[2][k]) + self.rounding;
+            (low, high)
         };
-        let (columns, rows, height) = (range(0), range(1), self.shape[1]);
-        columns.flat_map(move |x| rows.clone().map(move |y| x * height + y))
+        let ((left, right), (bottom, top)) = (bounds(0), bounds(1));
+        let (first, last) = (self.along(0, left), self.along(0, right));
+        let mut count = 0;
+        for x in first..=last {
+            let (mut low, mut high) = (bottom, top);
+            if last - first >= WIDE {
+                (low, high) = self.within_column(face, x);
+            }
+            for y in self.along(1, low)..=self.along(1, high) {
+                look(x * self.shape[1] + y);
+                count += 1;
+            }
+        }
+        count
+    }
+
+    /// From where to where a face reaches within a column of pixels, and a little beyond.
+    fn within_column(&self, face: &[[f64; 3]; 3], column: usize) -> (f64, f64) {
+        /// In pixels; for rounding.
+        const BEYOND: f64 = 0.01;
+        let pixel = 1.0 / self.inv_pixel;
+        let edge = |steps: f64| self.low[0] + steps * pixel;
+        // What lies beyond the screen, by rounding, counts to the columns at its ends.
+        let left = if column == 0 { f64::NEG_INFINITY } else { edge(column as f64 - BEYOND) };
+        let is_last = column + 1 == self.shape[0];
+        let right = if is_last { f64::INFINITY } else { edge(column as f64 + 1.0 + BEYOND) };
+        let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+        for k in 0..3 {
+            let (a, b) = (face[k], face[(k + 1) % 3]);
+            if a[0].max(b[0]) < left || a[0].min(b[0]) > right {
+                continue;
+            }
+            for (x, end) in [(a[0], a[1]), (b[0], b[1])] {
+                let inside = x.clamp(left, right);
+                let part = ((inside - a[0]) / (b[0] - a[0])).clamp(0.0, 1.0);
+                let y = if (left..=right).contains(&x) { end } else { a[1] + part * (b[1] - a[1]) };
+                (low, high) = (low.min(y), high.max(y));
+            }
+        }
+        (low - BEYOND * pixel, high + BEYOND * pixel)
+    }
+
+    fn pixel(&self, p: &[f64; 3]) -> usize {
+        self.along(0, p[0]) * self.shape[1] + self.along(1, p[1])
     }
 
     fn along(&self, k: usize, x: f64) -> usize {
@@ -171,12 +272,12 @@ impl Screen {
         (((x - self.low[k]) * self.inv_pixel) as usize).min(self.shape[k] - 1)
     }
 
-    /// Whether no face is between the point and the eye.
-    fn sees(&self, point: Point3<f64>) -> bool {
-        let p = on_screen(&self.axes, self.origin, &point);
-        let pixel = self.along(0, p[0]) * self.shape[1] + self.along(1, p[1]);
+    /// Whether no face is between the point, one that was asked for, and the eye.
+    fn sees(&self, point: &Point3<f64>) -> bool {
+        let p = on_screen(&self.axes, self.origin, point);
+        let pixel = self.pixel(&p);
         let shown = &self.shown[self.starts[pixel] as usize..self.starts[pixel + 1] as usize];
-        !shown.iter().any(|&face| self.hides(&self.faces[face as usize], p))
+        !shown.iter().any(|&face| self.hides(&self.corners(face as usize), p))
     }
 
     fn hides(&self, [a, b, c]: &[[f64; 3]; 3], p: [f64; 3]) -> bool {

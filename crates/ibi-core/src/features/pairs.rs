@@ -56,12 +56,12 @@ impl Pairs {
     /// How many pairs fall into each bin of each angle, for a point of that normal.
     #[inline(always)]
     #[allow(clippy::inline_always)]
-    pub(super) fn count(&mut self, normal: [f32; 3]) -> [[u16; SECTORS]; 3] {
+    pub(super) fn count(&mut self, normal: [f32; 3]) -> [[u32; SECTORS]; 3] {
         // Whole vectors; what they hold beyond the end is left from points before and not looked at.
         let padded = self.len.next_multiple_of(LANES);
         encode(self.columns.each_ref().map(|c| &c[..padded]), normal, &mut self.codes[..padded]);
         // Two of each, or flat ground waits for the same count again and again. With 16 bins no index needs a check.
-        let mut counts = [[[0_u16; 16]; 3]; 2];
+        let mut counts = [[[0_u32; 16]; 3]; 2];
         let codes = &self.codes[..self.len];
         for pair in codes.chunks(2) {
             for (counts, code) in counts.iter_mut().zip(pair) {

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use super::FeatureError;
 use super::door::{check_length, check_place, check_points};
 use super::normals::least_axis;
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::columns::{columns, middle};
 use crate::kernels::par;
 use crate::kernels::rng::Rng;
@@ -78,8 +78,14 @@ pub fn dominant_plane(
     if points.len() < 3 {
         return Ok(None);
     }
+    if !interrupt.enter(Phase::Plane) {
+        return Err(FeatureError::Interrupted);
+    }
     let Some(drawn) = best_draw(points, search, interrupt)? else { return Ok(None) };
-    let Some(plane) = fitted(points, drawn, search.distance) else { return Ok(None) };
+    let Some(plane) = fitted(points, drawn, search.distance, interrupt) else { return Ok(None) };
+    if interrupt.is_set() {
+        return Err(FeatureError::Interrupted);
+    }
     let inliers: Vec<bool> = points.iter().map(|p| plane.distance(p).abs() <= search.distance).collect();
     if (inliers.iter().filter(|&&near| near).count() as f64) < share * points.len() as f64 {
         return Ok(None);
@@ -162,16 +168,24 @@ fn count(points: &[Vec<f32>; 3], normal: [f32; 3], offset: f32) -> u32 {
 
 /// Fitted to the points near it, again and again until these stay the same. The fit may have fewer of them than the draw:
 /// the best draw leans towards what stands on the plane.
-fn fitted(points: &[Point3<f64>], drawn: Candidate, distance: f64) -> Option<Candidate> {
+fn fitted(
+    points: &[Point3<f64>],
+    drawn: Candidate,
+    distance: f64,
+    interrupt: &Interrupt,
+) -> Option<Candidate> {
     let mut plane = drawn;
     let mut last = 0;
     for _ in 0..FITS {
         let near = || points.iter().filter(|p| plane.distance(p).abs() <= distance);
         let count = near().count();
-        if count < 3 || count == last {
+        if count < 3 || count == last || interrupt.is_set() {
             break;
         }
         let mean = plane.through + near().map(|p| p - plane.through).sum::<Vector3<f64>>() / count as f64;
+        if interrupt.is_set() {
+            break;
+        }
         let spread: Matrix3<f64> = near().map(|p| (p - mean) * (p - mean).transpose()).sum();
         (plane, last) = (Candidate { normal: least_axis(&spread)?, through: mean }, count);
     }

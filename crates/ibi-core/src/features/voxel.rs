@@ -4,6 +4,9 @@ use nalgebra::{Point3, Vector3};
 
 use super::FeatureError;
 use super::door::{check_length, check_points, unit_normals};
+use crate::interrupt::{Interrupt, Phase};
+use crate::kernels::par;
+use crate::kernels::sort::sorted;
 
 /// A cloud with one point for each voxel.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,6 +16,9 @@ pub struct Thinned {
     /// The mean of their normals, of length 1; as many as points, if normals were given.
     pub normals: Option<Vec<Vector3<f64>>>,
 }
+
+/// Points, or voxels, that one thread takes at a time.
+const GRAIN: usize = 1 << 12;
 
 /// Bits of a key for each axis.
 const BITS: u32 = 21;
@@ -33,10 +39,14 @@ pub fn voxel_downsample(
     points: &[Point3<f64>],
     normals: Option<&[Vector3<f64>]>,
     voxel: f64,
+    interrupt: &Interrupt,
 ) -> Result<Thinned, FeatureError> {
     check_points("points", points)?;
     check_length("voxel", voxel)?;
     let unit = normals.map(|normals| unit_normals("normals", normals, points.len())).transpose()?;
+    if !interrupt.enter(Phase::Thin) {
+        return Err(FeatureError::Interrupted);
+    }
     let Some(&first) = points.first() else {
         return Ok(Thinned { points: Vec::new(), normals: unit });
     };
@@ -51,13 +61,32 @@ pub fn voxel_downsample(
         let cell = |axis: usize| ((p[axis] - origin[axis]) / voxel) as u64;
         (cell(0) << (2 * BITS)) | (cell(1) << BITS) | cell(2)
     };
-    let mut rows: Vec<(u64, u32)> = points.iter().map(key).zip(0..).collect();
-    rows.sort_unstable();
-    let voxels = || rows.chunk_by(|a, b| a.0 == b.0);
-    Ok(Thinned {
-        points: voxels().map(|voxel| mean(voxel, first, |row| points[row])).collect(),
-        normals: unit.map(|normals| voxels().map(|voxel| mean_direction(voxel, &normals)).collect()),
-    })
+    let keys = par::chunks(points.len(), GRAIN, |run| points[run].iter().map(key).collect::<Vec<_>>());
+    let rows: Vec<(u64, u32)> = keys.into_iter().flatten().zip(0..).collect();
+    let rows = sorted(rows, interrupt).ok_or(FeatureError::Interrupted)?;
+    let voxels: Vec<&[(u64, u32)]> = rows.chunk_by(|a, b| a.0 == b.0).collect();
+    let mean = |voxel: &&[(u64, u32)]| mean(voxel, first, |row| points[row]);
+    let normals = match unit {
+        Some(unit) => Some(each(&voxels, interrupt, |voxel| mean_direction(voxel, &unit))?),
+        None => None,
+    };
+    Ok(Thinned { points: each(&voxels, interrupt, mean)?, normals })
+}
+
+/// What `of` makes of each voxel.
+fn each<T: Send>(
+    voxels: &[&[(u64, u32)]],
+    interrupt: &Interrupt,
+    of: impl Fn(&&[(u64, u32)]) -> T + Sync + Send,
+) -> Result<Vec<T>, FeatureError> {
+    let parts = par::chunks(voxels.len(), GRAIN, |run| {
+        if interrupt.is_set() { Vec::new() } else { voxels[run].iter().map(&of).collect() }
+    });
+    if interrupt.is_set() {
+        Err(FeatureError::Interrupted)
+    } else {
+        Ok(parts.into_iter().flatten().collect())
+    }
 }
 
 /// Relative to `near`, so that clouds far from the origin lose nothing.

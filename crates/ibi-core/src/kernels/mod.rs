@@ -25,5 +25,6 @@ pub mod replicator;
 pub mod rng;
 pub mod sight;
 pub(crate) mod simd;
+pub(crate) mod sort;
 pub mod triangles;
 pub mod triplets;

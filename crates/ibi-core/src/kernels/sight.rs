@@ -1,12 +1,17 @@
 //! What a depth camera can see of a model, and what it has seen of the scene.
 
+use std::collections::HashMap;
 use std::f64::consts::PI;
+use std::sync::OnceLock;
 
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 
 use super::columns::middle;
 use super::grid::buckets;
+use super::nearby::mean_spacing;
 use super::par;
+use crate::interrupt::{Interrupt, Phase};
+use crate::pace::Pace;
 
 /// One of `count` directions that are evenly spread (the spiral of the golden angle, Vogel 1979).
 pub(crate) fn direction(index: usize, count: usize) -> Vector3<f64> {
@@ -57,33 +62,81 @@ const RISE: f64 = 0.25;
 /// Cells on a side at most.
 const MAX_CELLS: f64 = 1024.0;
 
+/// Of a larger cloud the shadows of so many points are worked out, at most: each of the others takes the answer of one in
+/// its voxel whose normal lies in the same octant, so that no point answers for the other side of a wall.
+const MOST: usize = 50_000;
+
+/// How much wider voxels become if too many are left, and how wide they are at first: so many spacings, if the points
+/// were few enough. On a surface they then hold a few each.
+const WIDEN: f64 = 1.25;
+const FIRST_WIDTH: f64 = 2.0;
+
 /// Which points of a surface the surface itself hides, as seen from far away in one of 128 directions.
 #[derive(Debug)]
 pub struct OwnShadow {
     middle: Point3<f64>,
     directions: Vec<Vector3<f64>>,
-    /// For each direction, for each point.
+    /// For each direction, for each point; of a large cloud for each of those that answer for others.
     is_hidden: Vec<Vec<bool>>,
+    of_all: Option<OfAll>,
+}
+
+/// The answers for all points of a large cloud.
+#[derive(Debug)]
+struct OfAll {
+    /// Which of the answers is that of each point.
+    answer: Vec<u32>,
+    /// For each direction, once it is asked for, for each point.
+    is_hidden: Vec<OnceLock<Vec<bool>>>,
 }
 
 impl OwnShadow {
     /// Of points with outward unit normals and their mean spacing.
     ///
     /// # Complexity
-    /// O(points) for each direction.
+    /// O(points) for each direction; no more than for 50,000 points, and O(points) beside it.
     #[must_use]
     pub fn new(points: &[Point3<f64>], normals: &[Vector3<f64>], spacing: f64) -> Self {
+        let nothing =
+            || Self { middle: Point3::origin(), directions: Vec::new(), is_hidden: Vec::new(), of_all: None };
+        Self::until(points, normals, spacing, &Interrupt::never()).unwrap_or_else(nothing)
+    }
+
+    /// The same; `None` if interrupted.
+    #[must_use]
+    pub fn until(
+        points: &[Point3<f64>],
+        normals: &[Vector3<f64>],
+        spacing: f64,
+        interrupt: &Interrupt,
+    ) -> Option<Self> {
+        if !interrupt.enter(Phase::Shadow) {
+            return None;
+        }
         let directions: Vec<_> = (0..DIRECTIONS).map(|i| direction(i, DIRECTIONS)).collect();
-        let is_hidden = par::map(DIRECTIONS, 1, |i| hidden(points, normals, spacing, &directions[i]));
-        Self { middle: middle(points).into(), directions, is_hidden }
+        let (mut some, mut of_all) = (None, None);
+        if points.len() > MOST {
+            let (rows, answer) = few(points, normals, spacing, interrupt)?;
+            let kept: Vec<_> = rows.iter().map(|&row| points[row as usize]).collect();
+            let spacing = mean_spacing(&kept);
+            some = Some((kept, rows.iter().map(|&row| normals[row as usize]).collect::<Vec<_>>(), spacing));
+            of_all = Some(OfAll { answer, is_hidden: (0..DIRECTIONS).map(|_| OnceLock::new()).collect() });
+        }
+        let (kept, of_kept, spacing) =
+            some.as_ref().map_or((points, normals, spacing), |(p, n, s)| (p, n, *s));
+        let is_hidden =
+            par::map(DIRECTIONS, 1, |i| hidden(kept, of_kept, spacing, &directions[i], interrupt));
+        let shadow = Self { middle: middle(points).into(), directions, is_hidden, of_all };
+        (!interrupt.is_set()).then_some(shadow)
     }
 
     /// The shadow on some of the points.
     #[must_use]
     pub fn on(&self, rows: &[u32]) -> Self {
-        let pick = |all: &Vec<bool>| rows.iter().map(|&row| all[row as usize]).collect();
+        let answer = |&row: &u32| self.of_all.as_ref().map_or(row, |of_all| of_all.answer[row as usize]);
+        let pick = |all: &Vec<bool>| rows.iter().map(|row| all[answer(row) as usize]).collect();
         let is_hidden = self.is_hidden.iter().map(pick).collect();
-        Self { middle: self.middle, directions: self.directions.clone(), is_hidden }
+        Self { middle: self.middle, directions: self.directions.clone(), is_hidden, of_all: None }
     }
 
     /// Which points are hidden from a camera at `eye` once the pose has moved them: from the nearest direction that is
@@ -93,7 +146,58 @@ impl OwnShadow {
         let to_eye = target_from_source.inverse_transform_point(eye) - self.middle;
         let nearest = (0..self.directions.len())
             .max_by(|&a, &b| self.directions[a].dot(&to_eye).total_cmp(&self.directions[b].dot(&to_eye)));
-        nearest.map_or(&[], |at| &self.is_hidden[at])
+        let Some(at) = nearest else { return &[] };
+        match &self.of_all {
+            None => &self.is_hidden[at],
+            Some(OfAll { answer, is_hidden }) => {
+                let spread = || answer.iter().map(|&i| self.is_hidden[at][i as usize]).collect();
+                is_hidden[at].get_or_init(spread)
+            }
+        }
+    }
+}
+
+/// At most [`MOST`] of the points, by row, and which of them answers for each point; `None` if interrupted.
+fn few(
+    points: &[Point3<f64>],
+    normals: &[Vector3<f64>],
+    spacing: f64,
+    interrupt: &Interrupt,
+) -> Option<(Vec<u32>, Vec<u32>)> {
+    /// For each axis.
+    const BITS: u32 = 20;
+    let first = *points.first()?;
+    let (low, high) = points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)));
+    let least = (high - low).max() / f64::from((1 << BITS) - 1);
+    let thinning = (points.len() as f64 / MOST as f64).sqrt();
+    let mut width = (FIRST_WIDTH * spacing * thinning).max(least).max(f64::MIN_POSITIVE);
+    let mut pace = Pace::new(interrupt);
+    loop {
+        let key = |p: &Point3<f64>, n: &Vector3<f64>| {
+            let cells = [0, 1, 2].map(|axis| ((p[axis] - low[axis]) / width) as u64);
+            let octant = n.iter().fold(0, |octant, &x| 2 * octant + u64::from(x < 0.0));
+            cells.iter().fold(octant, |key, cell| key << BITS | cell)
+        };
+        let (mut answers, mut rows) = (HashMap::new(), Vec::new());
+        let mut answer = Vec::with_capacity(points.len());
+        for (row, (p, n)) in (0..).zip(points.iter().zip(normals)) {
+            if pace.is_over(16) {
+                return None;
+            }
+            let next = rows.len() as u32;
+            let of = *answers.entry(key(p, n)).or_insert(next);
+            if of == next {
+                rows.push(row);
+                if rows.len() > MOST {
+                    break;
+                }
+            }
+            answer.push(of);
+        }
+        if rows.len() <= MOST {
+            return Some((rows, answer));
+        }
+        width *= WIDEN;
     }
 }
 
@@ -108,13 +212,17 @@ pub(crate) fn corners<'a>(places: impl IntoIterator<Item = &'a [f64; 2]>) -> ([f
     (low, high)
 }
 
-/// Which points are behind others, as seen from far away in the direction `to_eye`.
+/// Which points are behind others, as seen from far away in the direction `to_eye`; nothing if interrupted.
 fn hidden(
     points: &[Point3<f64>],
     normals: &[Vector3<f64>],
     spacing: f64,
     to_eye: &Vector3<f64>,
+    interrupt: &Interrupt,
 ) -> Vec<bool> {
+    if interrupt.is_set() {
+        return Vec::new();
+    }
     let [right, up] = across(to_eye);
     let on_screen: Vec<[f64; 2]> = points.iter().map(|p| [right.dot(&p.coords), up.dot(&p.coords)]).collect();
     let (low, high) = corners(&on_screen);
@@ -136,12 +244,15 @@ fn hidden(
             && before > BEFORE * spacing
             && offset.dot(&normals[p]) > RISE * before
     };
-    let is_hidden = |p: usize| {
+    let mut pace = Pace::new(interrupt);
+    let mut is_hidden = |p: usize| {
         let [column, row] = cell_of(&on_screen[p]);
         (column.saturating_sub(1)..(column + 2).min(shape[0])).any(|x| {
             let first = starts[x * shape[1] + row.saturating_sub(1)];
             let last = starts[x * shape[1] + (row + 2).min(shape[1])];
-            rows[first as usize..last as usize].iter().any(|&q| hides(q as usize, p))
+            // Cells may be crowded.
+            !pace.is_over((last - first) as usize)
+                && rows[first as usize..last as usize].iter().any(|&q| hides(q as usize, p))
         })
     };
     (0..points.len()).map(|p| normals[p].dot(to_eye) > 0.0 && is_hidden(p)).collect()

@@ -1,5 +1,9 @@
 //! The linear assignment problem.
 
+use super::MetricsError;
+use crate::interrupt::{Interrupt, Phase};
+use crate::pace::Pace;
+
 /// The assignment of rows to columns with the least total cost: `min(rows, cols)` pairs, no row and no
 /// column twice.
 ///
@@ -14,6 +18,10 @@
 /// for dense and sparse linear assignment problems", Computing 38 (1987); without its
 /// initialisation, which pays off only for problems far larger than the poses of a scene.
 ///
+/// # Errors
+///
+/// [`MetricsError::Interrupted`].
+///
 /// # Panics
 ///
 /// If `cost` does not hold `rows * cols` numbers.
@@ -25,34 +33,49 @@
 /// # Examples
 ///
 /// ```
+/// use ibi_core::Interrupt;
 /// use ibi_core::metrics::assignment;
 ///
+/// let never = Interrupt::never();
 /// // Greedy would take the 1 and be left with the 9: 10. The best total is 2 + 3.
 /// let cost = [1.0, 2.0, 3.0, 9.0];
-/// assert_eq!(assignment(&cost, 2, 2), [Some(1), Some(0)]);
+/// assert_eq!(assignment(&cost, 2, 2, &never)?, [Some(1), Some(0)]);
 /// // Three rows for two columns: one row stays alone.
 /// let cost = [5.0, 5.0, 1.0, 9.0, 9.0, 1.0];
-/// assert_eq!(assignment(&cost, 3, 2), [None, Some(0), Some(1)]);
+/// assert_eq!(assignment(&cost, 3, 2, &never)?, [None, Some(0), Some(1)]);
+/// # Ok::<(), ibi_core::metrics::MetricsError>(())
 /// ```
-#[must_use]
-pub fn assignment(cost: &[f64], rows: usize, cols: usize) -> Vec<Option<usize>> {
+pub fn assignment(
+    cost: &[f64],
+    rows: usize,
+    cols: usize,
+    interrupt: &Interrupt,
+) -> Result<Vec<Option<usize>>, MetricsError> {
     assert_eq!(cost.len(), rows * cols, "cost must hold rows * cols numbers");
+    if !interrupt.enter(Phase::Metrics) {
+        return Err(MetricsError::Interrupted);
+    }
     // The search wants every agent served, so the agents are the shorter side.
     if rows <= cols {
-        let (task_of, _) = assign(rows, cols, |row, col| cost[row * cols + col]);
-        task_of
+        let (task_of, _) = assign(rows, cols, |row, col| cost[row * cols + col], interrupt)?;
+        Ok(task_of)
     } else {
-        let (_, agent_of) = assign(cols, rows, |col, row| cost[row * cols + col]);
-        agent_of
+        let (_, agent_of) = assign(cols, rows, |col, row| cost[row * cols + col], interrupt)?;
+        Ok(agent_of)
     }
 }
 
-/// Assigns each of `agents` to one of at least as many `tasks`: the task of each agent, the agent of each task.
+/// The task of each agent, the agent of each task.
+type Assigned = (Vec<Option<usize>>, Vec<Option<usize>>);
+
+/// Assigns each of `agents` to one of at least as many `tasks`.
 fn assign(
     agents: usize,
     tasks: usize,
     cost: impl Fn(usize, usize) -> f64,
-) -> (Vec<Option<usize>>, Vec<Option<usize>>) {
+    interrupt: &Interrupt,
+) -> Result<Assigned, MetricsError> {
+    let mut pace = Pace::new(interrupt);
     let mut task_of = vec![None; agents];
     let mut agent_of = vec![None; tasks];
     // Invariant: cost - agent_price - task_price is >= 0, and 0 on assigned pairs, so path lengths in these
@@ -67,6 +90,9 @@ fn assign(
         let mut agent = newcomer;
         let mut travelled = 0.0;
         let free_task = loop {
+            if pace.is_over(tasks) {
+                return Err(MetricsError::Interrupted);
+            }
             let mut nearest: Option<usize> = None;
             for task in (0..tasks).filter(|&task| !settled[task]) {
                 let through = travelled + cost(agent, task) - agent_price[agent] - task_price[task];
@@ -79,7 +105,7 @@ fn assign(
                 }
             }
             // There are at least as many tasks as agents, so an unserved newcomer always finds one.
-            let Some(task) = nearest else { return (task_of, agent_of) };
+            let Some(task) = nearest else { return Ok((task_of, agent_of)) };
             settled[task] = true;
             travelled = length[task];
             match agent_of[task] {
@@ -110,13 +136,17 @@ fn assign(
             }
         }
     }
-    (task_of, agent_of)
+    Ok((task_of, agent_of))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    fn assignment(cost: &[f64], rows: usize, cols: usize) -> Vec<Option<usize>> {
+        super::assignment(cost, rows, cols, &Interrupt::never()).unwrap()
+    }
 
     fn total(cost: &[f64], cols: usize, columns: &[Option<usize>]) -> f64 {
         columns.iter().enumerate().filter_map(|(row, col)| col.map(|col| cost[row * cols + col])).sum()

@@ -1,6 +1,7 @@
 //! What counts as a hit, and among which pairs.
 
-use super::{Model, frobenius_distance, rotation_error_rad, translation_error};
+use super::{MetricsError, Model, frobenius_distance, rotation_error_rad, translation_error};
+use crate::interrupt::Interrupt;
 use nalgebra::Isometry3;
 use std::fmt;
 
@@ -98,20 +99,40 @@ pub enum Criterion<'m> {
 
 impl Criterion<'_> {
     /// How far apart a pair is: what the assignment minimises the sum of.
-    pub(super) fn distance(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>) -> f64 {
+    pub(super) fn distance(
+        &self,
+        predicted: &Isometry3<f64>,
+        truth: &Isometry3<f64>,
+        interrupt: &Interrupt,
+    ) -> Result<f64, MetricsError> {
         match self {
-            Self::Pose(_) => frobenius_distance(predicted, truth),
-            Self::AddS { model, .. } => model.add_s(predicted, truth),
+            Self::Pose(_) => Ok(frobenius_distance(predicted, truth)),
+            Self::AddS { model, .. } => model.add_s(predicted, truth, interrupt),
         }
     }
 
-    pub(super) fn is_hit(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>, distance: f64) -> bool {
+    /// The distance below which a pair may be a hit; infinite where more than the distance is asked.
+    pub(super) fn reach(&self, interrupt: &Interrupt) -> Result<f64, MetricsError> {
+        match self {
+            Self::Pose(_) => Ok(f64::INFINITY),
+            Self::AddS { model, diameter_fraction } => Ok(diameter_fraction * model.diameter(interrupt)?),
+        }
+    }
+
+    /// Whether a pair is a hit, its distance and [`Self::reach`] being known.
+    pub(super) fn is_hit(
+        &self,
+        predicted: &Isometry3<f64>,
+        truth: &Isometry3<f64>,
+        distance: f64,
+        reach: f64,
+    ) -> bool {
         match self {
             Self::Pose(below) => {
                 rotation_error_rad(predicted, truth) < below.rotation_rad
                     && translation_error(predicted, truth) < below.translation
             }
-            Self::AddS { model, diameter_fraction } => distance < diameter_fraction * model.diameter(),
+            Self::AddS { .. } => distance < reach,
         }
     }
 }

@@ -1,51 +1,123 @@
 //! The diameter of a cloud.
 
-use nalgebra::{Point3, Vector3};
+use std::ops::Range;
+
+use nalgebra::{Matrix3, Point3, Vector3};
+
+use super::MetricsError;
+use crate::features::least_axis;
+use crate::interrupt::{Interrupt, Phase};
+use crate::kernels::par;
+use crate::pace::Pace;
 
 /// Slack of the pruning bound: rounding may make a sum of two radii fall short of the true bound by a few
 /// units in the last place, and a pair must not be lost to that.
 const ROUNDING: f64 = 1.0 + 1e-12;
 
+/// Of no more points that are far enough out, all pairs are compared.
+const FEW: usize = 4096;
+
+/// Where there are more, a pair that is longer by no more than this part is not looked for: else clouds of
+/// which very many pairs are the longest but for rounding would take for ever.
+const NEGLIGIBLE: f64 = 1e-14;
+
+/// Points that one thread takes at a time.
+const GRAIN: usize = 1 << 14;
+
 /// The largest distance between two points of a cloud, exactly; 0 for fewer than two points.
 ///
 /// The unit in which ADD-S and MSSD thresholds are given. The answer is the one a comparison of all pairs
 /// would give; only pairs that cannot be the farthest are left out. About the centroid c,
-/// |p - q| <= |p - c| + |q - c|, so with the points sorted by that radius a whole tail of pairs falls once
-/// the sum is below a distance already seen. Two sweeps to the farthest point give such a distance, most
-/// often the diameter itself, before the search begins.
+/// |p - q| <= |p - c| + |q - c|, so a point falls once the sum with the largest radius is below a distance
+/// already seen. Sweeps to the farthest point give such a distance, most often the diameter itself, before
+/// the search begins. If more than 4096 points are left, as on a sphere, they are sorted into flat discs
+/// and pairs of discs are compared: then the answer may fall short by 1e-14 of it, a few units in the last place.
+///
+/// # Errors
+///
+/// [`MetricsError::Interrupted`].
 ///
 /// # Complexity
 ///
-/// O(n log n) for the elongated shapes most parts are; O(n^2) at worst, for points all about equally far
-/// from the centroid, as on a sphere.
+/// O(n) for the elongated shapes most parts are; about O(n log n) for points all about equally far
+/// from the centroid.
 ///
 /// # Examples
 ///
 /// ```
+/// use ibi_core::Interrupt;
 /// use ibi_core::metrics::diameter;
 /// use nalgebra::Point3;
 ///
 /// let box_corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 2.0, 2.0]].map(Point3::from);
-/// assert_eq!(diameter(&box_corners), 3.0);
+/// assert_eq!(diameter(&box_corners, &Interrupt::never())?, 3.0);
+/// # Ok::<(), ibi_core::metrics::MetricsError>(())
 /// ```
-#[must_use]
-pub fn diameter(points: &[Point3<f64>]) -> f64 {
-    if points.len() < 2 {
-        return 0.0;
+pub fn diameter(points: &[Point3<f64>], interrupt: &Interrupt) -> Result<f64, MetricsError> {
+    if !interrupt.enter(Phase::Diameter) {
+        return Err(MetricsError::Interrupted);
     }
-    let sum = points.iter().fold(Vector3::zeros(), |sum, p| sum + p.coords);
-    let centroid = Point3::from(sum / points.len() as f64);
-    let mut by_radius: Vec<(f64, Point3<f64>)> = points.iter().map(|p| ((p - centroid).norm(), *p)).collect();
+    if points.len() < 2 {
+        return Ok(0.0);
+    }
+    let sums = par::chunks(points.len(), GRAIN, |run| {
+        points[run].iter().fold(Vector3::zeros(), |sum, p| sum + p.coords)
+    });
+    let centroid = Point3::from(sums.iter().sum::<Vector3<f64>>() / points.len() as f64);
+    let (first, largest) = farthest(points, &centroid, interrupt)?;
+    let (one_end, _) = farthest(points, &first, interrupt)?;
+    let (_, longest) = farthest(points, &one_end, interrupt)?;
+
+    let kept = par::chunks(points.len(), GRAIN, |run| {
+        let is_far = |(radius, _): &(f64, _)| (radius + largest) * ROUNDING >= longest;
+        let with_radius = points[run].iter().map(|p| ((p - centroid).norm(), *p));
+        with_radius.filter(is_far).collect::<Vec<_>>()
+    });
+    let far = kept.concat();
+    if far.len() <= FEW {
+        compare_all(far, longest, interrupt)
+    } else {
+        compare_discs(far.into_iter().map(|(_, p)| p).collect(), longest, interrupt)
+    }
+}
+
+/// The point farthest from `from`, the first of equals, and its distance.
+fn farthest(
+    points: &[Point3<f64>],
+    from: &Point3<f64>,
+    interrupt: &Interrupt,
+) -> Result<(Point3<f64>, f64), MetricsError> {
+    let farther =
+        |best: (Point3<f64>, f64), next: (Point3<f64>, f64)| if next.1 > best.1 { next } else { best };
+    let parts = par::chunks(points.len(), GRAIN, |run| {
+        if interrupt.is_set() {
+            return (*from, 0.0);
+        }
+        points[run].iter().map(|p| (*p, (p - from).norm())).fold((*from, 0.0), farther)
+    });
+    if interrupt.is_set() {
+        return Err(MetricsError::Interrupted);
+    }
+    Ok(parts.into_iter().fold((*from, 0.0), farther))
+}
+
+/// The longest pair, at least `longest`, of points with their distances from one place: the tail of pairs of a point
+/// falls once the sum is below the longest so far.
+fn compare_all(
+    mut by_radius: Vec<(f64, Point3<f64>)>,
+    mut longest: f64,
+    interrupt: &Interrupt,
+) -> Result<f64, MetricsError> {
     by_radius.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
-
-    let (one_end, _) = farthest(points, &by_radius[0].1);
-    let (_, mut longest) = farthest(points, &one_end);
-
+    let mut pace = Pace::new(interrupt);
     for (rank, (radius, p)) in by_radius.iter().enumerate() {
         let rest = &by_radius[rank + 1..];
         // Every pair still to come is shorter than the best of this point's.
         if rest.first().is_none_or(|(next, _)| (radius + next) * ROUNDING < longest) {
             break;
+        }
+        if pace.is_over(rest.len()) {
+            return Err(MetricsError::Interrupted);
         }
         for (other_radius, q) in rest {
             if (radius + other_radius) * ROUNDING < longest {
@@ -54,15 +126,167 @@ pub fn diameter(points: &[Point3<f64>]) -> f64 {
             longest = longest.max((p - q).norm());
         }
     }
-    longest
+    Ok(longest)
 }
 
-/// The point farthest from `from` and its distance.
-fn farthest(points: &[Point3<f64>], from: &Point3<f64>) -> (Point3<f64>, f64) {
-    points.iter().fold((*from, 0.0), |best, p| {
-        let distance = (p - from).norm();
-        if distance > best.1 { (*p, distance) } else { best }
-    })
+/// Points of a leaf.
+const LEAF: usize = 16;
+
+/// Below this a thread builds a disc with all below it.
+const SERIAL: usize = 1 << 12;
+
+/// Pairs of discs that are handed to threads, about.
+const TASKS: usize = 256;
+
+/// How many points sweeps begin from.
+const SWEEPS: usize = 16;
+
+/// The same by a tree of discs, as a smooth surface has them: then what bounds a pair of discs is too large by the square of
+/// their size only, and of each disc few others are in question.
+fn compare_discs(
+    mut points: Vec<Point3<f64>>,
+    mut longest: f64,
+    interrupt: &Interrupt,
+) -> Result<f64, MetricsError> {
+    for k in 0..SWEEPS {
+        let (end, _) = farthest(&points, &points[k * points.len() / SWEEPS], interrupt)?;
+        longest = longest.max(farthest(&points, &end, interrupt)?.1);
+    }
+    let root = Disc::new(&mut points, 0, interrupt).ok_or(MetricsError::Interrupted)?;
+    // The tasks are the same on any number of threads, and none knows of what another one has found.
+    let mut tasks = vec![(&root, &root)];
+    loop {
+        let halved: Vec<_> = tasks.iter().flat_map(|&(a, b)| a.halves(b)).collect();
+        let is_done = halved.len() == tasks.len();
+        tasks = halved.into_iter().filter(|(a, b)| a.may_hold(b, longest)).collect();
+        if is_done || tasks.len() >= TASKS || interrupt.is_set() {
+            break;
+        }
+    }
+    let found = par::map(tasks.len(), 1, |i| {
+        let (mut longest, mut pace) = (longest, Pace::new(interrupt));
+        descend(&points, tasks[i], &mut longest, &mut pace);
+        longest
+    });
+    if interrupt.is_set() {
+        Err(MetricsError::Interrupted)
+    } else {
+        Ok(found.into_iter().fold(longest, f64::max))
+    }
+}
+
+/// Points within a flat cylinder.
+struct Disc {
+    centre: Point3<f64>,
+    /// The axis, half the length and the radius of the cylinder.
+    axis: Vector3<f64>,
+    half: f64,
+    radius: f64,
+    /// No point is farther from the centre.
+    reach: f64,
+    run: Range<usize>,
+    /// Two, unless it is a leaf.
+    parts: Option<Box<[Disc; 2]>>,
+}
+
+impl Disc {
+    /// Of `points`, which begin at `start`; sorts them. `None` if interrupted.
+    fn new(points: &mut [Point3<f64>], start: usize, interrupt: &Interrupt) -> Option<Self> {
+        if points.len() >= SERIAL && interrupt.is_set() {
+            return None;
+        }
+        let mean = points.iter().fold(Vector3::zeros(), |sum, p| sum + (p - points[0])) / points.len() as f64;
+        let centre = points[0] + mean;
+        let spread: Matrix3<f64> = points.iter().map(|p| (p - centre) * (p - centre).transpose()).sum();
+        let axis = least_axis(&spread).unwrap_or_else(Vector3::z);
+        let (mut half, mut radius_sq, mut reach_sq) = (0.0_f64, 0.0_f64, 0.0_f64);
+        for p in points.iter() {
+            let offset = p - centre;
+            let along = offset.dot(&axis);
+            half = half.max(along.abs());
+            radius_sq = radius_sq.max((offset - axis * along).norm_squared());
+            reach_sq = reach_sq.max(offset.norm_squared());
+        }
+        let run = start..start + points.len();
+        let mut disc =
+            Self { centre, axis, half, radius: radius_sq.sqrt(), reach: reach_sq.sqrt(), run, parts: None };
+        if points.len() <= LEAF || reach_sq == 0.0 {
+            return Some(disc);
+        }
+        let widest = spread.diagonal().imax();
+        let middle = points.len() / 2;
+        points.select_nth_unstable_by(middle, |a, b| a[widest].total_cmp(&b[widest]));
+        let is_large = points.len() >= SERIAL;
+        let (low, high) = points.split_at_mut(middle);
+        let mut low = || Self::new(low, start, interrupt);
+        let mut high = || Self::new(high, start + middle, interrupt);
+        let (low, high) = if is_large { par::join(low, high) } else { (low(), high()) };
+        disc.parts = Some(Box::new([low?, high?]));
+        Some(disc)
+    }
+
+    /// How far a point of it may lie from its centre along a direction of length 1.
+    fn along(&self, direction: &Vector3<f64>) -> f64 {
+        let cos = self.axis.dot(direction).abs().min(1.0);
+        (self.half * cos + self.radius * (1.0 - cos * cos).sqrt()).min(self.reach)
+    }
+
+    /// No pair of points of two discs is farther apart, but for rounding.
+    fn bound(&self, other: &Self) -> f64 {
+        let between = other.centre - self.centre;
+        let apart = between.norm();
+        let around = self.reach + other.reach;
+        if apart <= around {
+            return apart + around;
+        }
+        let direction = between / apart;
+        (apart + self.along(&direction) + other.along(&direction)).hypot(around).min(apart + around)
+    }
+
+    /// Whether a pair of points of two discs may be longer, by more than [`NEGLIGIBLE`].
+    fn may_hold(&self, other: &Self, longest: f64) -> bool {
+        self.bound(other) > longest * (1.0 + NEGLIGIBLE)
+    }
+
+    /// Pairs of smaller discs that hold the same pairs of points; this one if there are none.
+    fn halves<'a>(&'a self, other: &'a Self) -> Vec<(&'a Self, &'a Self)> {
+        if std::ptr::eq(self, other) {
+            return match &self.parts {
+                Some(parts) => vec![(&parts[0], &parts[0]), (&parts[0], &parts[1]), (&parts[1], &parts[1])],
+                None => vec![(self, other)],
+            };
+        }
+        let halve_self = other.parts.is_none() || self.reach >= other.reach;
+        match (&self.parts, &other.parts) {
+            (Some(parts), _) if halve_self => parts.iter().map(|part| (part, other)).collect(),
+            (_, Some(parts)) => parts.iter().map(|part| (self, part)).collect(),
+            _ => vec![(self, other)],
+        }
+    }
+}
+
+/// Raises `longest` to that of the pairs of points of two discs; false if interrupted.
+fn descend(points: &[Point3<f64>], (a, b): (&Disc, &Disc), longest: &mut f64, pace: &mut Pace<'_>) -> bool {
+    if pace.is_over(LEAF * LEAF) {
+        return false;
+    }
+    if a.parts.is_none() && b.parts.is_none() {
+        // All at one place: one stands for all.
+        let run = |disc: &Disc| {
+            if disc.reach > 0.0 { disc.run.clone() } else { disc.run.start..disc.run.start + 1 }
+        };
+        for p in &points[run(a)] {
+            for q in &points[run(b)] {
+                *longest = longest.max((p - q).norm());
+            }
+        }
+        return true;
+    }
+    let mut pairs: Vec<_> = a.halves(b).into_iter().map(|(a, b)| (a.bound(b), (a, b))).collect();
+    pairs.sort_by(|a, b| b.0.total_cmp(&a.0));
+    pairs
+        .into_iter()
+        .all(|(bound, pair)| bound <= *longest * (1.0 + NEGLIGIBLE) || descend(points, pair, longest, pace))
 }
 
 #[cfg(test)]
@@ -70,6 +294,10 @@ mod tests {
     use super::super::strategies::{isometries, points};
     use super::*;
     use proptest::prelude::*;
+
+    fn exact(points: &[Point3<f64>]) -> f64 {
+        diameter(points, &Interrupt::never()).unwrap()
+    }
 
     /// The naive twin.
     fn brute_force(points: &[Point3<f64>]) -> f64 {
@@ -79,7 +307,7 @@ mod tests {
     proptest! {
         #[test]
         fn equals_the_comparison_of_all_pairs(cloud in points(0..60)) {
-            prop_assert_eq!(diameter(&cloud), brute_force(&cloud));
+            prop_assert_eq!(exact(&cloud), brute_force(&cloud));
         }
 
         // On a sphere nothing can be pruned by radius: the worst case must be right too.
@@ -90,13 +318,44 @@ mod tests {
                 .filter_map(|p| p.coords.try_normalize(1e-3))
                 .map(|n| Point3::from(n.add_scalar(offset)))
                 .collect();
-            prop_assert_eq!(diameter(&sphere), brute_force(&sphere));
+            prop_assert_eq!(exact(&sphere), brute_force(&sphere));
         }
 
         #[test]
         fn does_not_change_under_a_rigid_motion(cloud in points(0..60), motion in isometries()) {
             let moved: Vec<_> = cloud.iter().map(|p| motion * p).collect();
-            prop_assert!((diameter(&moved) - diameter(&cloud)).abs() < 1e-9);
+            prop_assert!((exact(&moved) - exact(&cloud)).abs() < 1e-9);
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(12))]
+
+        // Too many for a comparison of all pairs, all nearly equally far out, some of them at one place: ellipsoids,
+        // clouds within, circles, two plates far apart. The naive twin is asked for a sample of the points, and of all
+        // as many as are far from them.
+        #[test]
+        fn of_many_points_by_discs_as_by_all_pairs(
+            half_axes in prop::array::uniform3(0.9..1.0_f64), flat in 0..4_u32, seed in 0..1000_u64, apart in 0.0..1e7_f64,
+        ) {
+            let mut rng = crate::kernels::rng::Rng::new(seed, 0, 0);
+            let mut point = || -> Point3<f64> {
+                let x: Vector3<f64> = Vector3::from([0; 3].map(|_: u32| 2.0 * rng.unit() - 1.0));
+                let on_ball = x.try_normalize(1e-3).unwrap_or_else(Vector3::x);
+                let p: Vector3<f64> = on_ball.component_mul(&Vector3::from(half_axes));
+                Point3::from(match flat {
+                    0 => p,
+                    1 => p * (1.0 - 0.001 * rng.unit()),
+                    2 => Vector3::new(p.x, p.y, 0.0).normalize(),
+                    _ => Vector3::new(x.x, x.y, if x.z > 0.0 { apart } else { 0.0 }),
+                })
+            };
+            let mut cloud: Vec<_> = (0..FEW + 500).map(|_| point()).collect();
+            cloud.extend_from_within(..FEW / 2);
+            let by_discs = compare_discs(cloud.clone(), 0.0, &Interrupt::never()).unwrap();
+            let naive = brute_force(&cloud);
+            prop_assert!(by_discs <= naive && by_discs >= naive * (1.0 - 2.0 * NEGLIGIBLE), "{by_discs} {naive}");
+            prop_assert!((exact(&cloud) - naive).abs() <= naive * 2.0 * NEGLIGIBLE);
         }
     }
 
@@ -106,13 +365,13 @@ mod tests {
         let grid: Vec<_> = (0..=3)
             .flat_map(|x| (0..=4).flat_map(move |y| (0..=5).map(move |z| Point3::new(x, y, z).cast::<f64>())))
             .collect();
-        assert_eq!(diameter(&grid), 50.0_f64.sqrt());
+        assert_eq!(exact(&grid), 50.0_f64.sqrt());
     }
 
     #[test]
     fn of_almost_nothing() {
-        assert_eq!(diameter(&[]), 0.0);
-        assert_eq!(diameter(&[Point3::new(1.0, 2.0, 3.0)]), 0.0);
-        assert_eq!(diameter(&[Point3::new(1.0, 2.0, 3.0); 5]), 0.0);
+        assert_eq!(exact(&[]), 0.0);
+        assert_eq!(exact(&[Point3::new(1.0, 2.0, 3.0)]), 0.0);
+        assert_eq!(exact(&[Point3::new(1.0, 2.0, 3.0); 5]), 0.0);
     }
 }

@@ -1,12 +1,22 @@
 //! What must hold for the score of any scene: invariances, bounds, agreement of its parts.
 
 use super::strategies::{isometries, points, scenes};
-use super::{Criterion, Matching, Model, PoseThresholds, SceneScore, score_scene};
+use super::{Criterion, Matching, Model, PoseThresholds, SceneScore};
+use crate::interrupt::Interrupt;
 use nalgebra::Isometry3;
 use proptest::prelude::*;
 use std::f64::consts::PI;
 
 const ECC: Criterion<'_> = Criterion::Pose(PoseThresholds { rotation_rad: PI / 9.0, translation: 0.5 });
+
+fn score_scene(
+    predicted: &[Isometry3<f64>],
+    truth: &[Isometry3<f64>],
+    matching: Matching,
+    criterion: &Criterion<'_>,
+) -> SceneScore {
+    super::score_scene(predicted, truth, matching, criterion, &Interrupt::never()).unwrap()
+}
 
 /// (truth hit, predicted hit, recall, precision, F1).
 fn summary(score: &SceneScore) -> (usize, usize, f64, f64, f64) {

@@ -12,23 +12,27 @@
 //!
 //! A pose is an [`Isometry3`](nalgebra::Isometry3) and reads `target_from_source`: it moves the model into
 //! the scene. Poses and points are finite by contract; nothing here looks for NaN again.
+//! What can take long takes an [`Interrupt`](crate::Interrupt), and runs on the pool that it is called in.
 //!
 //! # Examples
 //!
 //! ```
+//! use ibi_core::Interrupt;
 //! use ibi_core::metrics::{Criterion, Matching, PoseThresholds, score_scene};
 //! use nalgebra::Isometry3;
 //!
 //! let truth = [Isometry3::translation(0.0, 0.0, 0.0), Isometry3::translation(5.0, 0.0, 0.0)];
 //! let predicted = [Isometry3::translation(0.1, 0.0, 0.0), Isometry3::translation(0.2, 0.0, 0.0)];
+//! let never = Interrupt::never();
 //! let ecc = Criterion::Pose(PoseThresholds::ecc());
 //!
 //! // The second prediction repeats the first: a false positive here ...
-//! let strict = score_scene(&predicted, &truth, Matching::OneToOne, &ecc);
+//! let strict = score_scene(&predicted, &truth, Matching::OneToOne, &ecc, &never)?;
 //! assert_eq!((strict.recall, strict.precision), (0.5, 0.5));
 //! // ... and free here.
-//! let lenient = score_scene(&predicted, &truth, Matching::Any, &ecc);
+//! let lenient = score_scene(&predicted, &truth, Matching::Any, &ecc, &never)?;
 //! assert_eq!((lenient.recall, lenient.precision), (0.5, 1.0));
+//! # Ok::<(), ibi_core::metrics::MetricsError>(())
 //! ```
 
 #![cfg_attr(
@@ -84,6 +88,9 @@ pub enum MetricsError {
         /// The matching of scene `index`.
         found: Matching,
     },
+    /// The caller's token or clock has ended it.
+    #[error("interrupted")]
+    Interrupted,
     /// The hits do not fit the poses they are counted among, or, one to one, each other.
     #[error("more hits than poses, or hits that do not come in pairs")]
     ImpossibleCounts,

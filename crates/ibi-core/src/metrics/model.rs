@@ -1,7 +1,10 @@
 //! Errors between two poses of a model: ADD, ADD-S, MSSD.
 
 use super::{MetricsError, diameter};
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::neighbors::Neighbors;
+use crate::kernels::par;
+use crate::pace::Pace;
 use crate::symmetries::{BOP_STEP, Symmetries, Turning};
 use nalgebra::{Isometry3, Point3};
 use std::borrow::Cow;
@@ -15,18 +18,19 @@ use std::sync::OnceLock;
 /// # Examples
 ///
 /// ```
-/// use ibi_core::Symmetries;
 /// use ibi_core::metrics::Model;
+/// use ibi_core::{Interrupt, Symmetries};
 /// use nalgebra::{Isometry3, Point3, Vector3};
 /// use std::f64::consts::PI;
 ///
 /// let stick = Model::new(vec![Point3::new(-1.0, 0.0, 0.0), Point3::new(1.0, 0.0, 0.0)])?;
 /// let (truth, flipped) = (Isometry3::identity(), Isometry3::rotation(Vector3::z() * PI));
-/// assert_eq!(stick.diameter(), 2.0);
+/// let never = Interrupt::never();
+/// assert_eq!(stick.diameter(&never)?, 2.0);
 /// // Each end is 2 from where it belongs, but on the other end: the stick looks right.
 /// assert!((stick.add(&flipped, &truth) - 2.0).abs() < 1e-12);
-/// assert!(stick.add_s(&flipped, &truth) < 1e-12);
-/// assert!(stick.mssd(&flipped, &truth, &Symmetries::new(&[flipped], &[])?) < 1e-12);
+/// assert!(stick.add_s(&flipped, &truth, &never)? < 1e-12);
+/// assert!(stick.mssd(&flipped, &truth, &Symmetries::new(&[flipped], &[])?, &never)? < 1e-12);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug)]
@@ -35,6 +39,9 @@ pub struct Model {
     tree: OnceLock<Neighbors>,
     diameter: OnceLock<f64>,
 }
+
+/// Points that one thread takes at a time.
+const GRAIN: usize = 1024;
 
 impl Model {
     /// A model of these points, in its own frame.
@@ -59,9 +66,17 @@ impl Model {
     }
 
     /// The largest distance between two points, see [`diameter()`].
-    #[must_use]
-    pub fn diameter(&self) -> f64 {
-        *self.diameter.get_or_init(|| diameter(&self.points))
+    ///
+    /// # Errors
+    ///
+    /// [`MetricsError::Interrupted`]; the same of all that takes an [`Interrupt`].
+    pub fn diameter(&self, interrupt: &Interrupt) -> Result<f64, MetricsError> {
+        if let Some(&known) = self.diameter.get() {
+            return Ok(known);
+        }
+        // Not from within `get_or_init`: threads that wait for each other there could be those that have the work to do.
+        let diameter = diameter(&self.points, interrupt)?;
+        Ok(*self.diameter.get_or_init(|| diameter))
     }
 
     /// ADD: the mean distance between each model point under one pose and the same point under the other.
@@ -90,12 +105,43 @@ impl Model {
     /// # Complexity
     ///
     /// n queries of a kd-tree of n points.
-    #[must_use]
-    pub fn add_s(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>) -> f64 {
-        let tree = self.tree.get_or_init(|| Neighbors::new(&self.points));
+    ///
+    /// # Errors
+    ///
+    /// [`MetricsError::Interrupted`].
+    pub fn add_s(
+        &self,
+        predicted: &Isometry3<f64>,
+        truth: &Isometry3<f64>,
+        interrupt: &Interrupt,
+    ) -> Result<f64, MetricsError> {
+        if !interrupt.enter(Phase::Metrics) {
+            return Err(MetricsError::Interrupted);
+        }
+        let tree = self.tree(interrupt)?;
         // Asked in the model's frame, where one tree serves every pose.
         let difference = predicted.inverse() * truth;
-        self.mean(|p| tree.nearest(&(difference * p)).map_or(0.0, |(_, dist_sq)| dist_sq.sqrt()))
+        let parts = par::chunks(self.points.len(), GRAIN, |run| {
+            if interrupt.is_set() {
+                return Vec::new();
+            }
+            let gap = |p| tree.nearest(&(difference * p)).map_or(0.0, |(_, dist_sq)| dist_sq.sqrt());
+            self.points[run].iter().map(gap).collect()
+        });
+        if interrupt.is_set() {
+            return Err(MetricsError::Interrupted);
+        }
+        Ok(parts.into_iter().flatten().sum::<f64>() / self.points.len() as f64)
+    }
+
+    /// Built on first use.
+    fn tree(&self, interrupt: &Interrupt) -> Result<&Neighbors, MetricsError> {
+        if let Some(tree) = self.tree.get() {
+            return Ok(tree);
+        }
+        // As above.
+        let tree = Neighbors::until(&self.points, interrupt).ok_or(MetricsError::Interrupted)?;
+        Ok(self.tree.get_or_init(|| tree))
     }
 
     /// MSSD: the largest distance between a model point under the prediction and the same point under the
@@ -110,30 +156,47 @@ impl Model {
     ///
     /// O(n s) at worst for n points and s symmetries; a symmetry is left at the first point worse than the
     /// best symmetry before it.
-    #[must_use]
-    pub fn mssd(&self, predicted: &Isometry3<f64>, truth: &Isometry3<f64>, symmetries: &Symmetries) -> f64 {
+    ///
+    /// # Errors
+    ///
+    /// [`MetricsError::Interrupted`].
+    pub fn mssd(
+        &self,
+        predicted: &Isometry3<f64>,
+        truth: &Isometry3<f64>,
+        symmetries: &Symmetries,
+        interrupt: &Interrupt,
+    ) -> Result<f64, MetricsError> {
+        if !interrupt.enter(Phase::Metrics) {
+            return Err(MetricsError::Interrupted);
+        }
         let (predicted, motions) = match symmetries.turning() {
             Turning::None => (*predicted, Cow::from(symmetries.discrete())),
             _ => (symmetries.nearest(predicted, truth), symmetries.listed(BOP_STEP).into()),
         };
         let difference = predicted.inverse() * truth;
-        let mut least_sq = f64::INFINITY;
+        let (mut least_sq, mut pace) = (f64::INFINITY, Pace::new(interrupt));
         for symmetry in motions.iter() {
-            least_sq = least_sq.min(self.max_dist_sq(&(difference * symmetry), least_sq));
+            let (max_sq, num_moved) = self.max_dist_sq(&(difference * symmetry), least_sq);
+            if pace.is_over(num_moved) {
+                return Err(MetricsError::Interrupted);
+            }
+            least_sq = least_sq.min(max_sq);
         }
-        least_sq.sqrt()
+        Ok(least_sq.sqrt())
     }
 
-    /// The largest squared distance a point moves by; any number above `enough` once it is above that.
-    fn max_dist_sq(&self, motion: &Isometry3<f64>, enough: f64) -> f64 {
+    /// The largest squared distance a point moves by, any number above `enough` once it is above that; and how many points
+    /// were moved.
+    fn max_dist_sq(&self, motion: &Isometry3<f64>, enough: f64) -> (f64, usize) {
         let mut max_sq = 0.0_f64;
-        for p in &self.points {
+        for (num, p) in (1..).zip(&self.points) {
             max_sq = max_sq.max((motion * p - p).norm_squared());
             if max_sq > enough {
-                break;
+                return (max_sq, num);
             }
         }
-        max_sq
+        (max_sq, self.points.len())
     }
 
     fn mean(&self, error: impl Fn(&Point3<f64>) -> f64) -> f64 {
@@ -185,16 +248,16 @@ mod tests {
         ) {
             let add = model.points().iter().map(|p| (a * p - b * p).norm()).sum::<f64>();
             prop_assert!((model.add(&a, &b) - add / model.points().len() as f64).abs() < 1e-9);
-            prop_assert!((model.add_s(&a, &b) - naive_add_s(&model, &a, &b)).abs() < 1e-9);
-            prop_assert!((model.mssd(&a, &b, &Symmetries::new(&symmetries, &[]).unwrap()) - naive_mssd(&model, &a, &b, &symmetries)).abs() < 1e-9);
+            prop_assert!((model.add_s(&a, &b, &Interrupt::never()).unwrap() - naive_add_s(&model, &a, &b)).abs() < 1e-9);
+            prop_assert!((model.mssd(&a, &b, &Symmetries::new(&symmetries, &[]).unwrap(), &Interrupt::never()).unwrap() - naive_mssd(&model, &a, &b, &symmetries)).abs() < 1e-9);
         }
 
         #[test]
         fn in_their_order(model in models(), a in isometries(), b in isometries()) {
             // The closest point is no farther than the same point, a mean no larger than a maximum.
-            let (add, add_s) = (model.add(&a, &b), model.add_s(&a, &b));
+            let (add, add_s) = (model.add(&a, &b), model.add_s(&a, &b, &Interrupt::never()).unwrap());
             prop_assert!(add_s <= add + 1e-9);
-            prop_assert!(add <= model.mssd(&a, &b, &Symmetries::none()) + 1e-9);
+            prop_assert!(add <= model.mssd(&a, &b, &Symmetries::none(), &Interrupt::never()).unwrap() + 1e-9);
         }
 
         // Moving the scene changes nothing; neither does giving the model in another frame.
@@ -205,11 +268,11 @@ mod tests {
             let left = (motion * a, motion * b);
             let right = (a * motion, b * motion);
             prop_assert!((model.add(&left.0, &left.1) - model.add(&a, &b)).abs() < 1e-9);
-            prop_assert!((model.add_s(&left.0, &left.1) - model.add_s(&a, &b)).abs() < 1e-9);
-            prop_assert!((model.mssd(&left.0, &left.1, &none) - model.mssd(&a, &b, &none)).abs() < 1e-9);
+            prop_assert!((model.add_s(&left.0, &left.1, &Interrupt::never()).unwrap() - model.add_s(&a, &b, &Interrupt::never()).unwrap()).abs() < 1e-9);
+            prop_assert!((model.mssd(&left.0, &left.1, &none, &Interrupt::never()).unwrap() - model.mssd(&a, &b, &none, &Interrupt::never()).unwrap()).abs() < 1e-9);
             prop_assert!((moved.add(&right.0, &right.1) - model.add(&a, &b)).abs() < 1e-9);
-            prop_assert!((moved.add_s(&right.0, &right.1) - model.add_s(&a, &b)).abs() < 1e-9);
-            prop_assert!((moved.mssd(&right.0, &right.1, &none) - model.mssd(&a, &b, &none)).abs() < 1e-9);
+            prop_assert!((moved.add_s(&right.0, &right.1, &Interrupt::never()).unwrap() - model.add_s(&a, &b, &Interrupt::never()).unwrap()).abs() < 1e-9);
+            prop_assert!((moved.mssd(&right.0, &right.1, &none, &Interrupt::never()).unwrap() - model.mssd(&a, &b, &none, &Interrupt::never()).unwrap()).abs() < 1e-9);
         }
     }
 
@@ -227,9 +290,13 @@ mod tests {
         let predicted = truth * turn;
         // Each corner moves along one side, 2; the corner it lands on is where the model has one.
         assert!((square().add(&predicted, &truth) - 2.0).abs() < 1e-12);
-        assert!(square().add_s(&predicted, &truth) < 1e-12);
-        assert!((square().mssd(&predicted, &truth, &Symmetries::none()) - 2.0).abs() < 1e-12);
-        assert!(square().mssd(&predicted, &truth, &quarter) < 1e-12);
+        assert!(square().add_s(&predicted, &truth, &Interrupt::never()).unwrap() < 1e-12);
+        assert!(
+            (square().mssd(&predicted, &truth, &Symmetries::none(), &Interrupt::never()).unwrap() - 2.0)
+                .abs()
+                < 1e-12
+        );
+        assert!(square().mssd(&predicted, &truth, &quarter, &Interrupt::never()).unwrap() < 1e-12);
     }
 
     #[test]
@@ -238,8 +305,15 @@ mod tests {
         let predicted = Isometry3::rotation(Vector3::z() * PI);
         let quarter = Symmetries::new(&[Isometry3::rotation(Vector3::z() * FRAC_PI_2)], &[]).unwrap();
         let truth = Isometry3::identity();
-        assert!((square().mssd(&predicted, &truth, &Symmetries::none()) - 8.0_f64.sqrt()).abs() < 1e-12);
-        assert!((square().mssd(&predicted, &truth, &quarter) - 2.0).abs() < 1e-12);
+        assert!(
+            (square().mssd(&predicted, &truth, &Symmetries::none(), &Interrupt::never()).unwrap()
+                - 8.0_f64.sqrt())
+            .abs()
+                < 1e-12
+        );
+        assert!(
+            (square().mssd(&predicted, &truth, &quarter, &Interrupt::never()).unwrap() - 2.0).abs() < 1e-12
+        );
     }
 
     #[test]
@@ -249,8 +323,8 @@ mod tests {
         // The other way round: 9 -> 10 is 1, 10 -> 10 is 0, 19 -> 10 is 9: 10 / 3.
         let model = Model::new([0.0, 1.0, 10.0].map(|x| Point3::new(x, 0.0, 0.0)).to_vec()).unwrap();
         let (truth, predicted) = (Isometry3::identity(), Isometry3::translation(9.0, 0.0, 0.0));
-        assert!((model.add_s(&predicted, &truth) - 17.0 / 3.0).abs() < 1e-12);
-        assert!((model.add_s(&truth, &predicted) - 10.0 / 3.0).abs() < 1e-12);
+        assert!((model.add_s(&predicted, &truth, &Interrupt::never()).unwrap() - 17.0 / 3.0).abs() < 1e-12);
+        assert!((model.add_s(&truth, &predicted, &Interrupt::never()).unwrap() - 10.0 / 3.0).abs() < 1e-12);
     }
 
     #[test]

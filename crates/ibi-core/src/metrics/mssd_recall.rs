@@ -1,7 +1,8 @@
 //! MSSD recall, the score of the BOP challenge.
 
 use super::scene_score::{distances, recall};
-use super::{Matching, Model, assignment};
+use super::{Matching, MetricsError, Model, assignment};
+use crate::interrupt::{Interrupt, Phase};
 use crate::symmetries::Symmetries;
 use nalgebra::Isometry3;
 
@@ -27,10 +28,14 @@ pub struct MssdRecall {
 ///
 /// One MSSD per pair, then as [`score_scene`](super::score_scene).
 ///
+/// # Errors
+///
+/// [`MetricsError::Interrupted`].
+///
 /// # Examples
 ///
 /// ```
-/// use ibi_core::Symmetries;
+/// use ibi_core::{Interrupt, Symmetries};
 /// use ibi_core::metrics::{Matching, Model, mssd_recall};
 /// use nalgebra::{Isometry3, Point3};
 ///
@@ -38,24 +43,32 @@ pub struct MssdRecall {
 /// // Off by 0.22 of the diameter: missed at 0.05 .. 0.20, found at the six thresholds 0.25 .. 0.50.
 /// let predicted = [Isometry3::translation(0.22, 0.0, 0.0)];
 /// let (truth, none) = ([Isometry3::identity()], Symmetries::none());
-/// let recall = mssd_recall(&model, &predicted, &truth, &none, Matching::OneToOne);
+/// let recall = mssd_recall(&model, &predicted, &truth, &none, Matching::OneToOne, &Interrupt::never())?;
 /// assert!((recall.average - 0.6).abs() < 1e-12);
 /// # Ok::<(), ibi_core::metrics::MetricsError>(())
 /// ```
-#[must_use]
 pub fn mssd_recall(
     model: &Model,
     predicted: &[Isometry3<f64>],
     truth: &[Isometry3<f64>],
     symmetries: &Symmetries,
     matching: Matching,
-) -> MssdRecall {
-    let mssd = distances(predicted, truth, |p, t| model.mssd(p, t, symmetries));
+    interrupt: &Interrupt,
+) -> Result<MssdRecall, MetricsError> {
+    if !interrupt.enter(Phase::Metrics) {
+        return Err(MetricsError::Interrupted);
+    }
+    let mssd = distances(predicted.len(), truth.len(), interrupt, |row, col| {
+        model.mssd(&predicted[row], &truth[col], symmetries, interrupt)
+    })?;
+    let diameter = model.diameter(interrupt)?;
     // The error at which each truth is found, infinite if by nothing.
     let mut found_at = vec![f64::INFINITY; truth.len()];
     match matching {
         Matching::OneToOne => {
-            for (row, partner) in assignment(&mssd, predicted.len(), truth.len()).into_iter().enumerate() {
+            for (row, partner) in
+                assignment(&mssd, predicted.len(), truth.len(), interrupt)?.into_iter().enumerate()
+            {
                 if let Some(col) = partner {
                     found_at[col] = mssd[row * truth.len() + col];
                 }
@@ -69,10 +82,10 @@ pub fn mssd_recall(
         }
     }
     let recalls = MSSD_DIAMETER_FRACTIONS.map(|fraction| {
-        let below = fraction * model.diameter();
+        let below = fraction * diameter;
         recall(found_at.iter().filter(|&&error| error < below).count(), truth.len())
     });
-    MssdRecall { recalls, average: recalls.iter().sum::<f64>() / recalls.len() as f64 }
+    Ok(MssdRecall { recalls, average: recalls.iter().sum::<f64>() / recalls.len() as f64 })
 }
 
 #[cfg(test)]
@@ -84,6 +97,16 @@ mod tests {
     /// Along x, of diameter 1, so that a shift is its own MSSD as a part of the diameter.
     fn stick() -> Model {
         Model::new(vec![Point3::new(-0.5, 0.0, 0.0), Point3::new(0.5, 0.0, 0.0)]).unwrap()
+    }
+
+    fn mssd_recall(
+        model: &Model,
+        predicted: &[Isometry3<f64>],
+        truth: &[Isometry3<f64>],
+        symmetries: &Symmetries,
+        matching: Matching,
+    ) -> MssdRecall {
+        super::mssd_recall(model, predicted, truth, symmetries, matching, &Interrupt::never()).unwrap()
     }
 
     fn at(x: f64) -> Isometry3<f64> {

@@ -1,6 +1,9 @@
 //! The score of one scene.
 
 use super::{Criterion, Matching, MetricsError, assignment, rotation_error_rad, translation_error};
+use crate::interrupt::{Interrupt, Phase};
+use crate::kernels::par;
+use crate::pace::Pace;
 use crate::symmetries::Symmetries;
 use nalgebra::Isometry3;
 
@@ -126,50 +129,65 @@ impl SceneScore {
 /// One distance per pair (for ADD-S, n queries of a kd-tree each), then one to one an assignment,
 /// O(min^2 max) in the two numbers of poses.
 ///
+/// # Errors
+///
+/// [`MetricsError::Interrupted`].
+///
 /// # Examples
 ///
 /// See the [module](super).
-#[must_use]
 pub fn score_scene(
     predicted: &[Isometry3<f64>],
     truth: &[Isometry3<f64>],
     matching: Matching,
     criterion: &Criterion<'_>,
-) -> SceneScore {
-    score_scene_modulo(predicted, truth, matching, criterion, &Symmetries::none())
+    interrupt: &Interrupt,
+) -> Result<SceneScore, MetricsError> {
+    score_scene_modulo(predicted, truth, matching, criterion, &Symmetries::none(), interrupt)
 }
 
 /// [`score_scene`] of a model that looks the same from several sides: against each truth a prediction counts as the pose
 /// nearest to it of those that look like it ([`Symmetries::nearest`]). ADD-S sees to this by itself: of it only the
 /// errors of the [`PoseMatch`] change.
-#[must_use]
+///
+/// # Errors
+///
+/// [`MetricsError::Interrupted`].
 pub fn score_scene_modulo(
     predicted: &[Isometry3<f64>],
     truth: &[Isometry3<f64>],
     matching: Matching,
     criterion: &Criterion<'_>,
     symmetries: &Symmetries,
-) -> SceneScore {
+    interrupt: &Interrupt,
+) -> Result<SceneScore, MetricsError> {
+    if !interrupt.enter(Phase::Metrics) {
+        return Err(MetricsError::Interrupted);
+    }
     let seen = |row: usize, col: usize| match criterion {
         Criterion::AddS { .. } => predicted[row],
         Criterion::Pose(_) => symmetries.nearest(&predicted[row], &truth[col]),
     };
-    let distance: Vec<f64> = (0..predicted.len() * truth.len())
-        .map(|pair| (pair / truth.len(), pair % truth.len()))
-        .map(|(row, col)| criterion.distance(&seen(row, col), &truth[col]))
-        .collect();
+    let distance = distances(predicted.len(), truth.len(), interrupt, |row, col| {
+        criterion.distance(&seen(row, col), &truth[col], interrupt)
+    })?;
+    let reach = if distance.is_empty() { 0.0 } else { criterion.reach(interrupt)? };
     let is_hit = |row: usize, col: usize| {
-        criterion.is_hit(&seen(row, col), &truth[col], distance[row * truth.len() + col])
+        criterion.is_hit(&seen(row, col), &truth[col], distance[row * truth.len() + col], reach)
     };
     let partners: Vec<Option<usize>> = match matching {
-        Matching::OneToOne => assignment(&distance, predicted.len(), truth.len()),
+        Matching::OneToOne => assignment(&distance, predicted.len(), truth.len(), interrupt)?,
         Matching::Any => {
             let key = |row: usize, col: usize| (!is_hit(row, col), distance[row * truth.len() + col]);
             let nearer = |row: usize, a: usize, b: usize| {
                 let ((a_misses, a_distance), (b_misses, b_distance)) = (key(row, a), key(row, b));
                 a_misses.cmp(&b_misses).then(a_distance.total_cmp(&b_distance))
             };
-            (0..predicted.len()).map(|row| (0..truth.len()).min_by(|&a, &b| nearer(row, a, b))).collect()
+            let nearest = |row: usize| {
+                let is_asked = !interrupt.is_set();
+                (0..truth.len()).filter(|_| is_asked).min_by(|&a, &b| nearer(row, a, b))
+            };
+            par::map(predicted.len(), 1, nearest)
         }
     };
     let matches: Vec<Option<PoseMatch>> = partners
@@ -189,25 +207,44 @@ pub fn score_scene_modulo(
         })
         .collect();
 
+    if interrupt.is_set() {
+        return Err(MetricsError::Interrupted);
+    }
     let num_predicted_hit = matches.iter().flatten().filter(|m| m.is_hit).count();
     let num_truth_hit = match matching {
         Matching::OneToOne => num_predicted_hit,
         // Not from the list: one prediction may hit several truths, of which it names the nearest.
         Matching::Any => {
-            (0..truth.len()).filter(|&col| (0..predicted.len()).any(|row| is_hit(row, col))).count()
+            let mut pace = Pace::new(interrupt);
+            let mut is_found = |col: usize| {
+                !pace.is_over(PAIR * predicted.len()) && (0..predicted.len()).any(|row| is_hit(row, col))
+            };
+            (0..truth.len()).filter(|&col| is_found(col)).count()
         }
     };
+    if interrupt.is_set() {
+        return Err(MetricsError::Interrupted);
+    }
     let score = SceneScore::new(matching, truth.len(), predicted.len(), num_truth_hit, num_predicted_hit);
-    SceneScore { matches, ..score }
+    Ok(SceneScore { matches, ..score })
 }
 
-/// Row-major, one row per prediction.
+/// The work of one pair, in the units of [`Pace`].
+const PAIR: usize = 16;
+
+/// Row-major, one row per prediction: `distance(row, column)`.
 pub(super) fn distances(
-    predicted: &[Isometry3<f64>],
-    truth: &[Isometry3<f64>],
-    distance: impl Fn(&Isometry3<f64>, &Isometry3<f64>) -> f64,
-) -> Vec<f64> {
-    predicted.iter().flat_map(|p| truth.iter().map(|t| distance(p, t)).collect::<Vec<_>>()).collect()
+    rows: usize,
+    cols: usize,
+    interrupt: &Interrupt,
+    distance: impl Fn(usize, usize) -> Result<f64, MetricsError> + Sync + Send,
+) -> Result<Vec<f64>, MetricsError> {
+    let rows = par::map(rows, 1, |row| {
+        let mut pace = Pace::new(interrupt);
+        let each = |col| if pace.is_over(PAIR) { Err(MetricsError::Interrupted) } else { distance(row, col) };
+        (0..cols).map(each).collect::<Result<Vec<f64>, _>>()
+    });
+    Ok(rows.into_iter().collect::<Result<Vec<_>, _>>()?.concat())
 }
 
 /// 1 where there was nothing to find.
@@ -227,6 +264,15 @@ mod tests {
     use std::f64::consts::PI;
 
     const ECC: Criterion<'_> = Criterion::Pose(PoseThresholds { rotation_rad: PI / 9.0, translation: 0.5 });
+
+    fn score_scene(
+        predicted: &[Isometry3<f64>],
+        truth: &[Isometry3<f64>],
+        matching: Matching,
+        criterion: &Criterion<'_>,
+    ) -> SceneScore {
+        super::score_scene(predicted, truth, matching, criterion, &Interrupt::never()).unwrap()
+    }
 
     fn at(x: f64) -> Isometry3<f64> {
         Isometry3::translation(x, 0.0, 0.0)

@@ -6,6 +6,7 @@ use std::f64::consts::{PI, TAU};
 use super::group::{SAME_RAD, closure, find};
 use super::surface::{REACH, Shape};
 use super::{Axis, Symmetries, SymmetryError, about};
+use crate::interrupt::{Interrupt, Phase};
 
 /// How [`find_symmetries`] goes about it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,7 +53,7 @@ const GENERIC: [f64; 6] = [0.43, 0.71, 1.27, 1.93, 2.63, 2.95];
 ///
 /// # Errors
 /// If there are fewer than 10 points, a value is not finite, a normal has no length or there is not one for each point, or
-/// the tolerance is out of its range.
+/// the tolerance is out of its range. [`SymmetryError::Interrupted`].
 ///
 /// # Complexity
 /// About 0.1 to 0.3 s, for up to 8000 points and for more.
@@ -60,7 +61,7 @@ const GENERIC: [f64; 6] = [0.43, 0.71, 1.27, 1.93, 2.63, 2.95];
 /// # Examples
 /// ```
 /// use ibi_core::nalgebra::Point3;
-/// use ibi_core::{FindSymmetries, find_symmetries};
+/// use ibi_core::{FindSymmetries, Interrupt, find_symmetries};
 ///
 /// // A box of 4 x 3 x 2, its faces full of points: three half turns.
 /// let mut points = Vec::new();
@@ -72,7 +73,7 @@ const GENERIC: [f64; 6] = [0.43, 0.71, 1.27, 1.93, 2.63, 2.95];
 ///         }
 ///     }
 /// }
-/// let found = find_symmetries(&points, None, FindSymmetries::default())?;
+/// let found = find_symmetries(&points, None, FindSymmetries::default(), &Interrupt::never())?;
 /// assert_eq!(found.discrete().len(), 4);
 /// # Ok::<(), ibi_core::SymmetryError>(())
 /// ```
@@ -80,37 +81,50 @@ pub fn find_symmetries(
     points: &[Point3<f64>],
     normals: Option<&[Vector3<f64>]>,
     settings: FindSymmetries,
+    interrupt: &Interrupt,
 ) -> Result<Symmetries, SymmetryError> {
     let tolerance = settings.tolerance;
     if !(0.001..=0.5 * REACH).contains(&tolerance) {
         let allowed = "from 0.001 to 0.05 diameters";
         return Err(SymmetryError::Setting { argument: "tolerance", value: tolerance, allowed });
     }
-    let shape = Shape::new(points, normals)?;
-    let search = Search { shape: &shape, tolerance };
-    let motions = sorted(search.low_order());
-
-    let axes = search.continuous(&motions);
-    // Back to the place and the size of the model.
-    let place = |p: Point3<f64>| shape.centre + shape.size * p.coords;
-    let Some(first) = axes.first() else {
-        let motions = sorted([search.high_order(&motions), motions].concat());
-        let (centre, group) = search.group(&motions);
-        let motions: Vec<_> = group.iter().map(|turn| about(place(centre), *turn)).collect();
-        return Symmetries::new(&motions, &[]);
-    };
-    if let Some(other) = axes.get(1) {
-        // Two bodies of revolution in one are a ball; its middle is where the axes come closest.
-        let middle = crossing(first, other);
-        let axes = [Vector3::x(), Vector3::y()].map(|direction| Axis { direction, point: place(middle) });
-        return Symmetries::new(&[], &axes);
+    if !interrupt.enter(Phase::Symmetries) {
+        return Err(SymmetryError::Interrupted);
     }
-    let flip = search.flip(&motions, first);
-    // Of the points on the axis the one that stays where it is.
-    let middle = flip.map_or(first.point, |(_, centre)| centre);
-    let axis = Axis { direction: first.direction, point: place(middle) };
-    let motions: Vec<_> = flip.iter().map(|(turn, _)| about(axis.point, *turn)).collect();
-    Symmetries::new(&motions, &[axis])
+    let shape = Shape::new(points, normals, interrupt)?;
+    let search = Search { shape: &shape, tolerance, interrupt };
+    let found = search.find();
+    // What was found meanwhile is not all.
+    if interrupt.is_set() { Err(SymmetryError::Interrupted) } else { found }
+}
+
+impl Search<'_> {
+    /// All of them, back at the place and in the size of the model.
+    fn find(&self) -> Result<Symmetries, SymmetryError> {
+        let (search, shape) = (self, self.shape);
+        let motions = sorted(search.low_order());
+
+        let axes = search.continuous(&motions);
+        let place = |p: Point3<f64>| shape.centre + shape.size * p.coords;
+        let Some(first) = axes.first() else {
+            let motions = sorted([search.high_order(&motions), motions].concat());
+            let (centre, group) = search.group(&motions);
+            let motions: Vec<_> = group.iter().map(|turn| about(place(centre), *turn)).collect();
+            return Symmetries::new(&motions, &[]);
+        };
+        if let Some(other) = axes.get(1) {
+            // Two bodies of revolution in one are a ball; its middle is where the axes come closest.
+            let middle = crossing(first, other);
+            let axes = [Vector3::x(), Vector3::y()].map(|direction| Axis { direction, point: place(middle) });
+            return Symmetries::new(&[], &axes);
+        }
+        let flip = search.flip(&motions, first);
+        // Of the points on the axis the one that stays where it is.
+        let middle = flip.map_or(first.point, |(_, centre)| centre);
+        let axis = Axis { direction: first.direction, point: place(middle) };
+        let motions: Vec<_> = flip.iter().map(|(turn, _)| about(axis.point, *turn)).collect();
+        Symmetries::new(&motions, &[axis])
+    }
 }
 
 /// The best first.
@@ -145,11 +159,15 @@ impl Motion {
 struct Search<'a> {
     shape: &'a Shape,
     tolerance: f64,
+    interrupt: &'a Interrupt,
 }
 
 impl Search<'_> {
     /// A start, polished and checked; `None` if it fails, comes to the identity or is known.
     fn tried(&self, start: &Isometry3<f64>, known: &[Motion]) -> Option<Motion> {
+        if self.interrupt.is_set() {
+            return None;
+        }
         let motion = self.shape.refined(start);
         let is_known = || known.iter().any(|m| m.motion.rotation.angle_to(&motion.rotation) < SAME_RAD);
         if motion.rotation.angle() < 2.0 * SAME_RAD || is_known() {
@@ -159,11 +177,18 @@ impl Search<'_> {
         (deviation <= self.tolerance).then_some(Motion { motion, deviation })
     }
 
+    fn passes(&self, motion: &Isometry3<f64>) -> bool {
+        !self.interrupt.is_set() && self.shape.deviation(motion) <= self.tolerance
+    }
+
     /// Motions of low order about any axis.
     fn low_order(&self) -> Vec<Motion> {
         let principal = self.shape.principal_axes();
         let mut found: Vec<Motion> = Vec::new();
         for angle in ANGLES {
+            if self.interrupt.is_set() {
+                break;
+            }
             let start = |direction: &Vector3<f64>| {
                 Isometry3::rotation(direction * angle) // about the mean of the points
             };
@@ -211,7 +236,7 @@ impl Search<'_> {
 
     /// Axes about which any turn passes: no more than two, as a ball has all.
     fn continuous(&self, motions: &[Motion]) -> Vec<Axis> {
-        let passes = |axis: &Axis, angle: f64| self.shape.deviation(&axis.turn(angle)) <= self.tolerance;
+        let passes = |axis: &Axis, angle: f64| self.passes(&axis.turn(angle));
         let (mut axes, mut looked_at): (Vec<Axis>, Vec<Axis>) = (Vec::new(), Vec::new());
         for axis in motions.iter().map(Motion::axis) {
             let is_same = |other: &Axis| between(&other.direction, &axis.direction) < SAME_AXIS_RAD;
@@ -240,7 +265,7 @@ impl Search<'_> {
         let middle = 0.5 * (axis.point.coords.dot(&u) + (found.motion * axis.point).coords.dot(&u));
         let centre = axis.point + u * (middle - axis.point.coords.dot(&u));
         let turn = UnitQuaternion::from_scaled_axis(across * PI);
-        (self.shape.deviation(&about(centre, turn)) <= self.tolerance).then_some((turn, centre))
+        self.passes(&about(centre, turn)).then_some((turn, centre))
     }
 
     /// The largest group that grows from the best motions, all of whose members pass; and the point they leave in place.
@@ -255,9 +280,7 @@ impl Search<'_> {
             let Some(larger) = closure(&group, whole_fraction(&motion.motion.rotation)) else { continue };
             members.push(motion);
             let about_centre = fixed_point(&members);
-            let passes = |turn: &UnitQuaternion<f64>| {
-                self.shape.deviation(&about(about_centre, *turn)) <= self.tolerance
-            };
+            let passes = |turn: &UnitQuaternion<f64>| self.passes(&about(about_centre, *turn));
             if larger.iter().skip(1).all(passes) {
                 (group, centre) = (larger, about_centre);
             } else {

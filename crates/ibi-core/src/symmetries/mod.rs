@@ -14,6 +14,7 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::{PI, TAU};
 
 use crate::checks::MAX_COORDINATE;
+use crate::features::FeatureError;
 use crate::metrics::rotation_error_rad;
 
 /// The step in which BOP lists the turns about an axis: no point of the model moves farther than this part of its
@@ -123,9 +124,21 @@ pub enum SymmetryError {
         /// How many there should be.
         least: usize,
     },
+    /// The caller's token or clock has ended the search.
+    #[error("interrupted")]
+    Interrupted,
     /// Points or normals that cannot be used.
     #[error(transparent)]
-    Cloud(#[from] crate::features::FeatureError),
+    Cloud(FeatureError),
+}
+
+impl From<FeatureError> for SymmetryError {
+    fn from(error: FeatureError) -> Self {
+        match error {
+            FeatureError::Interrupted => Self::Interrupted,
+            error => Self::Cloud(error),
+        }
+    }
 }
 
 impl Default for Symmetries {

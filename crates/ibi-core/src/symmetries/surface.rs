@@ -55,6 +55,7 @@ impl Shape {
     pub(super) fn new(
         points: &[Point3<f64>],
         normals: Option<&[Vector3<f64>]>,
+        interrupt: &Interrupt,
     ) -> Result<Self, SymmetryError> {
         let (low, high) = match points.first() {
             Some(&first) => points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p))),
@@ -64,14 +65,15 @@ impl Shape {
         let extent = (high - low).norm();
         let is_large = points.len() > MOST_POINTS;
         let voxel = if is_large { extent / VOXELS } else { extent / f64::from(1 << 19) };
-        let thinned = voxel_downsample(points, normals, if voxel > 0.0 { voxel } else { 1.0 })?;
+        let thinned = voxel_downsample(points, normals, if voxel > 0.0 { voxel } else { 1.0 }, interrupt)?;
         let len = thinned.points.len();
         if len < LEAST_POINTS {
             return Err(SymmetryError::TooFewPoints { len, least: LEAST_POINTS });
         }
         let centre = Point3::from(thinned.points.iter().map(|p| p - low).sum::<Vector3<f64>>() / len as f64);
         let centre = low + centre.coords;
-        let size = diameter(&sampled(&thinned.points, DIAMETER_POINTS));
+        let size = diameter(&sampled(&thinned.points, DIAMETER_POINTS), interrupt);
+        let size = size.map_err(|_| SymmetryError::Interrupted)?;
         let points: Vec<Point3<f64>> =
             thinned.points.iter().map(|p| Point3::from((p - centre) / size)).collect();
         let gap = gap(&points);
@@ -80,7 +82,7 @@ impl Shape {
         } else {
             // Enough neighbours for a plane, however the points are spread.
             let around = Neighborhood { radius: 3.0 * gap, max_neighbors: 20 };
-            estimate_normals(&points, around, None, &Interrupt::never())?
+            estimate_normals(&points, around, None, interrupt)?
         };
         let nearby = Nearby::new(&points, REACH);
         let [rough, fine] =

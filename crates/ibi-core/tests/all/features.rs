@@ -47,7 +47,7 @@ proptest! {
     fn voxels_are_their_twin(cloud in points(0..60), voxel in 0.05..30.0) {
         let mut rng = Rng::new(1);
         let normals: Vec<Vector3<f64>> = cloud.iter().map(|_| rng.normal_vector()).collect();
-        let thin = voxel_downsample(&cloud, Some(&normals), voxel).unwrap();
+        let thin = voxel_downsample(&cloud, Some(&normals), voxel, &Interrupt::never()).unwrap();
         let voxels = naive::voxels(&cloud, voxel);
         prop_assert_eq!(thin.points.len(), voxels.len());
         for ((p, n), rows) in thin.points.iter().zip(thin.normals.unwrap()).zip(voxels.values()) {
@@ -62,12 +62,12 @@ proptest! {
 #[test]
 fn voxels_that_cannot_be_counted_are_refused() {
     let cloud = [Point3::origin(), Point3::new(1.0, 0.0, 0.0)];
-    let error = voxel_downsample(&cloud, None, 1e-7).unwrap_err();
+    let error = voxel_downsample(&cloud, None, 1e-7, &Interrupt::never()).unwrap_err();
     assert_eq!(
         error.to_string(),
         "voxel is 1e-7 and the points are 1e0 across; at most 2097152 voxels fit along an axis"
     );
-    assert_eq!(voxel_downsample(&cloud, None, 1e-6).unwrap().points.len(), 2);
+    assert_eq!(voxel_downsample(&cloud, None, 1e-6, &Interrupt::never()).unwrap().points.len(), 2);
 }
 
 // ---------------------------------------------------------------------------------------------------- normals

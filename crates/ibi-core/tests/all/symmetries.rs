@@ -22,7 +22,8 @@ fn cloud(solid: &Solid, seed: u64) -> Sampled {
 }
 
 fn found(cloud: &Sampled) -> Symmetries {
-    find_symmetries(&cloud.points, Some(&cloud.normals), FindSymmetries::default()).unwrap()
+    find_symmetries(&cloud.points, Some(&cloud.normals), FindSymmetries::default(), &Interrupt::never())
+        .unwrap()
 }
 
 /// Each shape with the number of its motions, and of its axes.
@@ -53,11 +54,13 @@ fn finds_the_group_of_each_shape() {
             }
             let cloud = cloud(&solid, seed);
             let normals = with_normals.then_some(&cloud.normals[..]);
-            let found = find_symmetries(&cloud.points, normals, FindSymmetries::default()).unwrap();
+            let found =
+                find_symmetries(&cloud.points, normals, FindSymmetries::default(), &Interrupt::never())
+                    .unwrap();
             let counts = (found.discrete().len(), found.continuous().len());
             assert_eq!(counts, (motions, axes), "{name}, with normals: {with_normals}");
             // Each of them maps the shape onto itself, as far as the points tell: nothing is farther off than their gaps.
-            let size = Model::new(cloud.points.clone()).unwrap().diameter();
+            let size = Model::new(cloud.points.clone()).unwrap().diameter(&Interrupt::never()).unwrap();
             for motion in found.discretised(0.5).unwrap() {
                 let off = farthest_off(&cloud.points, &motion) / size;
                 assert!(off < 0.09, "{name}: off by {off}");
@@ -110,20 +113,24 @@ fn what_is_found_is_a_group_to_rounding() {
 #[test]
 fn a_search_needs_points_and_a_tolerance() {
     let few = vec![Point3::origin(); 20];
-    let error = find_symmetries(&few, None, FindSymmetries::default()).unwrap_err();
+    let error = find_symmetries(&few, None, FindSymmetries::default(), &Interrupt::never()).unwrap_err();
     assert_eq!(error.to_string(), "points has 1 rows that differ; at least 10 are needed");
-    let error = find_symmetries(&few, None, FindSymmetries { tolerance: 0.5 }).unwrap_err();
+    let error =
+        find_symmetries(&few, None, FindSymmetries { tolerance: 0.5 }, &Interrupt::never()).unwrap_err();
     assert_eq!(error.to_string(), "tolerance is 0.5; it must be from 0.001 to 0.05 diameters");
     let mut bad = cloud(&shapes::tee(), 1).points;
     bad[7].y = f64::NAN;
     assert!(
-        find_symmetries(&bad, None, FindSymmetries::default()).unwrap_err().to_string().contains("points[7]")
+        find_symmetries(&bad, None, FindSymmetries::default(), &Interrupt::never())
+            .unwrap_err()
+            .to_string()
+            .contains("points[7]")
     );
     // Shapes of no volume, and of no area: an answer, and no panic.
     for flat in [Vector3::new(1.0, 1.0, 0.0), Vector3::new(1.0, 0.0, 0.0)] {
         let points: Vec<_> =
             cloud(&shapes::tee(), 1).points.iter().map(|p| p.coords.component_mul(&flat).into()).collect();
-        assert!(find_symmetries(&points, None, FindSymmetries::default()).is_ok());
+        assert!(find_symmetries(&points, None, FindSymmetries::default(), &Interrupt::never()).is_ok());
     }
 }
 
@@ -199,9 +206,9 @@ proptest! {
         for symmetries in declared() {
             let all = symmetries.discretised(0.02).unwrap();
             let seen = truth * all[(pick * all.len() as f64) as usize];
-            prop_assert!(model.mssd(&seen, &truth, &symmetries) < 1e-6);
+            prop_assert!(model.mssd(&seen, &truth, &symmetries, &Interrupt::never()).unwrap() < 1e-6);
             let strict = Criterion::Pose(PoseThresholds::strict(1e-3));
-            let score = score_scene_modulo(&[seen], &[truth], Matching::OneToOne, &strict, &symmetries);
+            let score = score_scene_modulo(&[seen], &[truth], Matching::OneToOne, &strict, &symmetries, &Interrupt::never()).unwrap();
             prop_assert_eq!(score.num_truth_hit, 1);
         }
     }

@@ -82,7 +82,10 @@ impl LocalGtm {
     }
 
     fn build(&self, context: &Context<'_>) -> Graph {
-        let diameter_pr = context.scene.source.diameter() / context.scene.resolution;
+        // Interrupted, nobody looks at the graph.
+        let source = context.scene.source;
+        let diameter_pr =
+            source.diameter(context.interrupt).unwrap_or(source.extent) / context.scene.resolution;
         let (max_degree, max_vicinity) = match self.first_look.filter(|_| context.is_first_look) {
             Some(max_vicinity) => (self.max_degree.min(FIRST_DEGREE), max_vicinity),
             None => (self.max_degree, u32::MAX),
