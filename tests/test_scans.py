@@ -330,8 +330,9 @@ def test_a_fused_scan_with_normals_is_told_of(pile, part, tilts):
 # Units ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("factor", [25.4, 10, 2.54])
-@pytest.mark.parametrize("is_larger", [False, True])
+@pytest.mark.parametrize(
+    ("factor", "is_larger"), [(25.4, False), (10, False), (25.4, True), (10, True), (2.54, True)]
+)
 def test_where_nothing_is_found_the_factor_that_would_fit_is_named(pile, factor, is_larger):
     model = ibi.Model.from_mesh(VERTICES * factor if is_larger else VERTICES / factor, FACES)
     found = model.detect(pile.points, viewpoint=EYE)

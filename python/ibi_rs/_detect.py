@@ -35,8 +35,8 @@ PLANE_VOXELS = 1.5
 MAX_BEHIND = 0.02
 """A table has nothing behind it; the largest plane of a heap of parts has."""
 
-MIN_VOXELS_PER_DIAMETER = 6
-"""In larger voxels a part is a few points, which fit everywhere."""
+MIN_VOXELS_PER_DIAMETER, FEW_VOXELS_PER_DIAMETER = 8, 12
+"""In larger voxels a part is a few points, which fit everywhere; below the second number that is told."""
 COARSE = 1.15
 """A scan whose points are so much coarser than the voxel is matched at one that it fills."""
 VOXEL_STEPS_PER_DOUBLING = 8

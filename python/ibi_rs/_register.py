@@ -95,9 +95,10 @@ def register(
     Raises
     ------
     InputError
-        An array has a wrong shape, a value that is not finite, or an index out of range, or a variant needs
-        one that is not given, or a stage of your own returns what cannot be used; the message names the
-        argument, the place and what is allowed. A ValueError.
+        An array has a wrong shape, a value that is not finite, or an index out of range, or lies so far from
+        the origin that its numbers are as coarse as its points are dense; or a variant needs one that is not
+        given, or a stage of your own returns what cannot be used; the message names the argument, the place
+        and what is allowed. A ValueError.
     ParamsError
         A parameter is out of range. A ValueError.
     TypeError
@@ -224,10 +225,12 @@ class Model:
             In the unit of the scenes; or an object with ``.vertices`` and ``.faces`` (trimesh), or with
             ``.vertices`` and ``.triangles`` (Open3D).
         faces : (F, 3) array_like of int
-            Rows of ``vertices``, counter-clockwise as seen from outside. Left out where the object has them.
+            Rows of ``vertices``; left out where the object has them. Where they are seen from their backs
+            only, their normals are turned: it does not matter how the faces of a closed mesh are wound.
         voxel : float, optional
             Spacing of the points, data units; above 0. By default 1/24 of the diagonal of the mesh, and less,
-            down to 1/48, where that leaves fewer than 700 points. A scan should not be much coarser.
+            down to 1/48, where that leaves fewer than 700 points. In a scan that is coarser the model is
+            thinned to what the scan can carry, and the result says so.
         symmetries : Symmetries or "find", optional
             As in :class:`Model`; ``"find"`` looks for them on the mesh, by :func:`find_symmetries` on points
             half a voxel apart, which takes 0.1 to 0.5 s.
@@ -316,12 +319,15 @@ class Model:
 
     @property
     def spacing(self) -> float:
-        """Mean distance of a point to its nearest other point, in data units."""
+        """Mean distance of a point to its nearest distinct one, data units; far strays do not count."""
         return self._source.spacing
 
     @property
     def voxel(self) -> float:
-        """What :meth:`detect` thins a scene to, data units: the mesh's voxel, or 1.25 times the spacing."""
+        """What :meth:`detect` thins a scene to, data units: the mesh's voxel, or 1.25 times the spacing.
+
+        A scan that is coarser is thinned to what it can carry: ``Matches.voxel``.
+        """
         return self._voxel
 
     @property
@@ -359,18 +365,20 @@ class Model:
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
 
-        The scene is thinned to :attr:`voxel`, its table taken away, its normals estimated; both clouds are
-        described by FPFH over 6 voxels, and each scene point is joined to the four model points most like it.
+        The scene is thinned to :attr:`voxel`, or to what it can carry if it is coarser, its table taken away,
+        its normals estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined
+        to the four model points most like it.
 
         Parameters
         ----------
-        tgt, tgt_normals, viewpoint, remove_plane, num_threads
+        tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads
             As in :meth:`detect`.
 
         Returns
         -------
         Matches
-            ``tgt, tgt_normals, corr, similarity``, for :meth:`register`.
+            ``tgt, tgt_normals, corr, similarity``, for :meth:`register`; and as attributes ``voxel`` and
+            ``warnings``. Empty where the scan holds nothing but a table or stray points.
 
         Raises
         ------
@@ -449,11 +457,17 @@ class Model:
                 f"the scan is too coarse, at a voxel of {scan.voxel:.3g}, for a model {self.diameter:.3g}"
                 " across; nothing is looked for"
             )
-        elif scan.voxel > self._voxel and self._has_hand_voxel:
-            yield (
-                f"the scan is coarser than the voxel of {self._voxel:.3g} that the model was given; "
-                f"{scan.voxel:.3g} was used"
-            )
+        elif scan.voxel > self._voxel:
+            if self._has_hand_voxel:
+                yield (
+                    f"the scan is coarser than the voxel of {self._voxel:.3g} that the model was given; "
+                    f"{scan.voxel:.3g} was used"
+                )
+            if scan.voxel * _detect.FEW_VOXELS_PER_DIAMETER > self.diameter:
+                yield (
+                    f"the scan is coarse, at a voxel of {scan.voxel:.3g}, for a model {self.diameter:.3g}"
+                    " across; poses are less sure"
+                )
         if eye is not None and scan.table_above:
             yield "viewpoint: nearly all of the scan lies behind its largest plane; is it on the right side?"
         elif eye is not None:
@@ -487,8 +501,9 @@ class Model:
 
         Parameters
         ----------
-        tgt : (N, 3) array_like
-            The scan, as in :func:`register`, in the unit of the model.
+        tgt : (N, 3) or (H, W, 3) array_like
+            The scan, as in :func:`register`, in the unit of the model. Points that are not finite are left
+            out.
         params : Params, optional
             By default ``Params.single_view()`` with a viewpoint and ``Params()`` without one.
         tgt_normals : (N, 3) array_like, optional
@@ -500,19 +515,27 @@ class Model:
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
             less than 2 % of the points lie behind it, as the viewpoint sees it.
+        check_units : bool, default True
+            Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts
+            is the box around all points but the outermost hundredth on each side; fewer than 100 points tell
+            nothing.
         num_threads, max_instances, timeout_s, callback
             As in :func:`register`.
 
         Returns
         -------
         Registration
-            Its ``labels`` and ``inliers`` are rows of the correspondences of :meth:`correspond`.
+            Its ``labels`` and ``inliers`` are rows of the correspondences of :meth:`correspond`; its
+            ``warnings`` tell what is doubtful: points left out, a scan coarser than the voxel that was asked
+            for, a viewpoint that the scan contradicts, normals of the model that point inwards, and, where
+            nothing is found, the factor between two units that would explain it. Empty, and no error, for a
+            scan that holds nothing.
 
         Raises
         ------
         InputError
             As :func:`register`; the model has no normals, neither a viewpoint nor normals are given, or the
-            scene cannot be in the unit of the model, being 10 times smaller or 300 times larger.
+            scene cannot be in the unit of the model (``check_units``).
         TypeError, ValueError
             As :func:`register`.
 

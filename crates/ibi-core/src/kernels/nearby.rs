@@ -237,7 +237,8 @@ impl WithSimd for NearestEach<'_> {
 ///
 /// - more than [`FEW_TWINS`] of the points have a twin: one nearer than the points of a straight line could be, were they
 ///   as many and as far spread, by a factor of [`TWIN`]. Then one of each set of twins counts.
-/// - some points lie more than [`STRAY`] times the median off: far pixels of a depth camera. They do not count.
+/// - points that lie more than [`STRAY`] times the median off would more than double it: far pixels of a depth camera.
+///   They do not count.
 ///
 /// 0 if all points coincide.
 ///
@@ -304,16 +305,21 @@ fn one_of_each<K: Eq + std::hash::Hash>(
     points.iter().filter(|p| seen.insert(key(p))).copied().collect()
 }
 
-/// The mean of the distances that are not far above their median; 0 if there are none.
+/// The mean of the distances, without those far above the median if they would more than double it; 0 if there are none.
 fn mean_without_strays(mut distances: Vec<f64>) -> f64 {
-    if distances.is_empty() {
-        return 0.0;
-    }
+    let mean = |distances: &[f64]| {
+        if distances.is_empty() { 0.0 } else { distances.iter().sum::<f64>() / distances.len() as f64 }
+    };
+    let of_all = mean(&distances);
+    let half = distances.len() / 2;
     let mut sorted = distances.clone();
-    let half = sorted.len() / 2;
+    if sorted.is_empty() {
+        return of_all;
+    }
     let most = STRAY * *sorted.select_nth_unstable_by(half, f64::total_cmp).1;
     distances.retain(|&distance| distance <= most);
-    distances.iter().sum::<f64>() / distances.len() as f64
+    let of_most = mean(&distances);
+    if of_all > 2.0 * of_most { of_most } else { of_all }
 }
 
 /// The mean distance from a point to its nearest other point; 0 for fewer than two points. Points that coincide are 0
