@@ -20,7 +20,7 @@ fn cloud(kind: u8, n: usize, seed: u64) -> Vec<Point3<f64>> {
         2 => Point3::from(rng.in_box(1.0)),
         _ => {
             let p = rng.in_box(1.0);
-            Point3::new(p.x, p.y, if i % 3 == 0 { 0.5 } else { 0.0 })
+            Point3::new(p.x, p.y, if i.is_multiple_of(3) { 0.5 } else { 0.0 })
         }
     };
     (0..n).map(&mut point).collect()
