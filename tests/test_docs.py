@@ -101,7 +101,7 @@ def test_every_field_is_explained(name):
 
 
 def test_the_attributes_of_a_registration_are_explained():
-    held = {"labels", "rounds", "stop_reason", "timings", "resolution", "params"}
+    held = {"labels", "rounds", "stop_reason", "timings", "resolution", "params", "warnings"}
     assert entries(inspect.getdoc(ibi.Registration), "Attributes") >= held
 
 

@@ -58,6 +58,34 @@ def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
     return _aligned(array, np.float64)
 
 
+def _scan_points(name: str, value: Any) -> tuple[npt.NDArray[np.float64], int]:
+    """(N, 3) float64 of a scan, organised or not, without rows that are not finite; and how many went."""
+    points, _, num_dropped = _scan(name, value, None)
+    return points, num_dropped
+
+
+def _scan(
+    name: str, points: Any, normals: Any
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None, int]:
+    """Points and normals of a scan, as `_scan_points`: a row of which the point is not finite goes."""
+    if isinstance(points, np.ndarray) and points.ndim == 3:
+        points = points.reshape(-1, points.shape[-1])
+    if isinstance(normals, np.ndarray) and normals.ndim == 3:
+        normals = normals.reshape(-1, normals.shape[-1])
+    held = _points(name, points)
+    of_points = None if normals is None else _points(f"{name}_normals", normals)
+    if of_points is not None and len(of_points) != len(held):
+        raise InputError(
+            f"{name}_normals has {len(of_points)} rows; it must have one for each of the {len(held)} rows of"
+            f" {name}"
+        )
+    finite = np.isfinite(held).all(axis=1)
+    num_dropped = len(held) - int(finite.sum())
+    if num_dropped:
+        held, of_points = held[finite], None if of_points is None else of_points[finite]
+    return held, of_points, num_dropped
+
+
 def _frames(name: str, value: Any) -> npt.NDArray[np.float64]:
     array = _real(name, value)
     if array.ndim != 3 or array.shape[1:] != (3, 3):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs import _core, _detect
+from ibi_rs import _core, _detect, _doubts
 from ibi_rs._detect import Matches
 from ibi_rs._inputs import (
     Points,
@@ -22,6 +22,7 @@ from ibi_rs._inputs import (
     _num_threads,
     _number,
     _points,
+    _scan,
     _vector,
 )
 from ibi_rs._match import match
@@ -94,9 +95,10 @@ def register(
     Raises
     ------
     InputError
-        An array has a wrong shape, a value that is not finite, or an index out of range, or a variant needs
-        one that is not given, or a stage of your own returns what cannot be used; the message names the
-        argument, the place and what is allowed. A ValueError.
+        An array has a wrong shape, a value that is not finite, or an index out of range, or lies so far from
+        the origin that its numbers are as coarse as its points are dense; or a variant needs one that is not
+        given, or a stage of your own returns what cannot be used; the message names the argument, the place
+        and what is allowed. A ValueError.
     ParamsError
         A parameter is out of range. A ValueError.
     TypeError
@@ -174,7 +176,8 @@ class Model:
     """
 
     _voxel: float
-    _features: npt.NDArray[np.float32] | None = None
+    _is_mesh = False
+    _has_hand_voxel = False
 
     def __init__(
         self,
@@ -197,7 +200,10 @@ class Model:
         self._points = _frozen(points.copy())
         self._normals = None if of_points is None else _frozen(of_points.copy())
         self._frames = None if axes is None else _frozen(axes.copy())
+        _doubts.check_step("src", points, self.spacing)
         self._voxel = _detect.VOXELS_PER_SPACING * self.spacing
+        self._described: dict[float, _detect.Described] = {}
+        self._inward: float | None = None
 
     @classmethod
     def from_mesh(
@@ -219,10 +225,12 @@ class Model:
             In the unit of the scenes; or an object with ``.vertices`` and ``.faces`` (trimesh), or with
             ``.vertices`` and ``.triangles`` (Open3D).
         faces : (F, 3) array_like of int
-            Rows of ``vertices``, counter-clockwise as seen from outside. Left out where the object has them.
+            Rows of ``vertices``; left out where the object has them. Where they are seen from their backs
+            only, their normals are turned: it does not matter how the faces of a closed mesh are wound.
         voxel : float, optional
             Spacing of the points, data units; above 0. By default 1/24 of the diagonal of the mesh, and less,
-            down to 1/48, where that leaves fewer than 700 points. A scan should not be much coarser.
+            down to 1/48, where that leaves fewer than 700 points. In a scan that is coarser the model is
+            thinned to what the scan can carry, and the result says so.
         symmetries : Symmetries or "find", optional
             As in :class:`Model`; ``"find"`` looks for them on the mesh, by :func:`find_symmetries` on points
             half a voxel apart, which takes 0.1 to 0.5 s.
@@ -263,12 +271,13 @@ class Model:
         if isinstance(symmetries, str) and symmetries != "find":
             raise _core.InputError(f"symmetries is {symmetries!r}; it must be 'find' or Symmetries")
         mesh = _points("vertices", vertices), _faces(faces)
+        has_hand_voxel = voxel is not None
         points, normals, voxel = _detect.mesh_points(*mesh, voxel, num_threads)
         if symmetries == "find":
             dense, of_dense, _ = _detect.mesh_points(*mesh, 0.5 * voxel, num_threads)
             symmetries = find_symmetries(dense, of_dense)
         model = cls(points, normals=normals, symmetries=symmetries)
-        model._voxel = voxel
+        model._voxel, model._is_mesh, model._has_hand_voxel = voxel, True, has_hand_voxel
         return model
 
     @property
@@ -310,12 +319,15 @@ class Model:
 
     @property
     def spacing(self) -> float:
-        """Mean distance of a point to its nearest other point, in data units."""
+        """Mean distance of a point to its nearest distinct one, data units; far strays do not count."""
         return self._source.spacing
 
     @property
     def voxel(self) -> float:
-        """What :meth:`detect` thins a scene to, data units: the mesh's voxel, or 1.25 times the spacing."""
+        """What :meth:`detect` thins a scene to, data units: the mesh's voxel, or 1.25 times the spacing.
+
+        A scan that is coarser is thinned to what it can carry: ``Matches.voxel``.
+        """
         return self._voxel
 
     @property
@@ -332,12 +344,14 @@ class Model:
 
     def __getstate__(self) -> dict[str, Any]:
         state = {"points": self._points, "normals": self._normals, "frames": self._frames}
-        return state | {"voxel": self._voxel, "symmetries": self._symmetries}
+        origin = {"voxel": self._voxel, "is_mesh": self._is_mesh, "has_hand_voxel": self._has_hand_voxel}
+        return state | origin | {"symmetries": self._symmetries}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         arrays = {name: state[name] for name in ("normals", "frames", "symmetries")}
         Model.__init__(self, state["points"], **arrays)
-        self._voxel = state["voxel"]
+        self._voxel, self._is_mesh = state["voxel"], state["is_mesh"]
+        self._has_hand_voxel = state["has_hand_voxel"]
 
     def correspond(
         self,
@@ -346,28 +360,43 @@ class Model:
         tgt_normals: npt.ArrayLike | None = None,
         viewpoint: npt.ArrayLike | View | None = None,
         remove_plane: bool | None = None,
+        check_units: bool = True,
         num_threads: int | None = None,
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
 
-        The scene is thinned to :attr:`voxel`, its table taken away, its normals estimated; both clouds are
-        described by FPFH over 6 voxels, and each scene point is joined to the four model points most like it.
+        The scene is thinned to :attr:`voxel`, or to what it can carry if it is coarser, its table taken away,
+        its normals estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined
+        to the four model points most like it.
 
         Parameters
         ----------
-        tgt, tgt_normals, viewpoint, remove_plane, num_threads
+        tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads
             As in :meth:`detect`.
 
         Returns
         -------
         Matches
-            ``tgt, tgt_normals, corr, similarity``, for :meth:`register`.
+            ``tgt, tgt_normals, corr, similarity``, for :meth:`register`; and as attributes ``voxel`` and
+            ``warnings``. Empty where the scan holds nothing but a table or stray points.
 
         Raises
         ------
         InputError, TypeError, ValueError
             Those of :meth:`detect`.
         """
+        return self._match(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)[0]
+
+    def _match(
+        self,
+        tgt: Points,
+        tgt_normals: npt.ArrayLike | None,
+        viewpoint: npt.ArrayLike | View | None,
+        remove_plane: bool | None,
+        check_units: bool,
+        num_threads: int | None,
+    ) -> tuple[Matches, npt.NDArray[np.float64]]:
+        """Match, and return with it the points that were measured."""
         if self._normals is None:
             raise _core.InputError("src_normals: detection needs them; give normals=, or use Model.from_mesh")
         if viewpoint is None and tgt_normals is None:
@@ -375,21 +404,84 @@ class Model:
                 "viewpoint: give it (the camera's place, [0, 0, 0] in most scans) or tgt_normals: "
                 "descriptors have to know which side of a surface is the outer one"
             )
-        points = _points("tgt", tgt)
-        _detect.check_units(self.diameter, points)
-        scene, normals = _detect.scene_points(
-            points,
-            None if tgt_normals is None else _points("tgt_normals", tgt_normals),
-            self._voxel,
-            _camera(viewpoint)[0],
-            remove_plane,
-            num_threads,
+        points, normals, num_dropped = _scan("tgt", tgt, tgt_normals)
+        _doubts.check_step("tgt", points)
+        if check_units:
+            _doubts.check_units(self.diameter, points)
+        eye = _camera(viewpoint)[0]
+        scan = _detect.scan_points(
+            points, normals, self._voxel, self.diameter, eye, remove_plane, num_threads
         )
-        if self._features is None:
-            self._features = _detect.describe(self._points, self._normals, self._voxel, num_threads)
-        described = _detect.describe(scene, normals, self._voxel, num_threads)
-        corr, similarity = match(self._features, described, k=_detect.PER_POINT, num_threads=num_threads)
-        return Matches(scene, normals, corr, similarity)
+        matches = self._match_scan(scan, num_threads)
+        matches.voxel = scan.voxel
+        matches.warnings = tuple(self._warnings(scan, len(points), eye, num_dropped))
+        return matches, points
+
+    def _match_scan(self, scan: _detect.Scan, num_threads: int | None) -> Matches:
+        size = float(np.linalg.norm(np.ptp(scan.points, axis=0))) if len(scan.points) >= 3 else 0.0
+        if size <= self.spacing or not self._is_known_at(scan.voxel):
+            return Matches(scan.points, scan.normals, np.empty((0, 2), np.int64), np.empty(0))
+        assert self._normals is not None  # `correspond` has looked
+        if scan.voxel not in self._described:
+            self._described[scan.voxel] = _detect.described(
+                self._points, self._normals, self.spacing, self._voxel, scan.voxel, num_threads
+            )
+        rows, of_model = self._described[scan.voxel]
+        described = _detect.describe(scan.points, scan.normals, scan.voxel, num_threads)
+        corr, similarity = match(of_model, described, k=_detect.PER_POINT, num_threads=num_threads)
+        if rows is not None:
+            corr[:, 0] = rows[corr[:, 0]]
+        return Matches(scan.points, scan.normals, corr, similarity)
+
+    def _is_known_at(self, voxel: float) -> bool:
+        """Whether enough is left of this model in such voxels, unless they are its own."""
+        return voxel <= max(self._voxel, self.diameter / _detect.MIN_VOXELS_PER_DIAMETER)
+
+    def _warnings(
+        self,
+        scan: _detect.Scan,
+        num_points: int,
+        eye: list[float] | None,
+        num_dropped: int,
+    ) -> Iterator[str]:
+        """Say what is doubtful about a scan, and about this model."""
+        if num_dropped:
+            given = num_dropped + num_points
+            yield f"{num_dropped} of {given} points of the scan are not finite, and were left out"
+        if num_points < 3:
+            yield f"the scan has {num_points} points"
+        elif len(scan.points) < 3:
+            yield "the scan is a table, or stray points, and nothing else"
+        elif not self._is_known_at(scan.voxel):
+            yield (
+                f"the scan is too coarse, at a voxel of {scan.voxel:.3g}, for a model {self.diameter:.3g}"
+                " across; nothing is looked for"
+            )
+        elif scan.voxel > self._voxel:
+            if self._has_hand_voxel:
+                yield (
+                    f"the scan is coarser than the voxel of {self._voxel:.3g} that the model was given; "
+                    f"{scan.voxel:.3g} was used"
+                )
+            if scan.voxel * _detect.FEW_VOXELS_PER_DIAMETER > self.diameter:
+                yield (
+                    f"the scan is coarse, at a voxel of {scan.voxel:.3g}, for a model {self.diameter:.3g}"
+                    " across; poses are less sure"
+                )
+        if eye is not None and scan.table_above:
+            yield "viewpoint: nearly all of the scan lies behind its largest plane; is it on the right side?"
+        elif eye is not None:
+            doubt = _doubts.viewpoint_warning(eye, scan.whole, scan.whole_normals, scan.voxel)
+            if doubt is not None:
+                yield doubt
+        if not self._is_mesh and self._normals is not None:
+            if self._inward is None:
+                self._inward = _doubts.inward(self._points, self._normals, self.spacing)
+            if self._inward > _doubts.MAX_INWARD:
+                yield (
+                    f"src_normals: {self._inward:.0%} of those that are seen from outside point inwards; they"
+                    " have to point outwards"
+                )
 
     def detect(
         self,
@@ -399,6 +491,7 @@ class Model:
         tgt_normals: npt.ArrayLike | None = None,
         viewpoint: npt.ArrayLike | View | None = None,
         remove_plane: bool | None = None,
+        check_units: bool = True,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -408,8 +501,9 @@ class Model:
 
         Parameters
         ----------
-        tgt : (N, 3) array_like
-            The scan, as in :func:`register`, in the unit of the model.
+        tgt : (N, 3) or (H, W, 3) array_like
+            The scan, as in :func:`register`, in the unit of the model. Points that are not finite are left
+            out.
         params : Params, optional
             By default ``Params.single_view()`` with a viewpoint and ``Params()`` without one.
         tgt_normals : (N, 3) array_like, optional
@@ -421,19 +515,27 @@ class Model:
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
             less than 2 % of the points lie behind it, as the viewpoint sees it.
+        check_units : bool, default True
+            Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts
+            is the box around all points but the outermost hundredth on each side; fewer than 100 points tell
+            nothing.
         num_threads, max_instances, timeout_s, callback
             As in :func:`register`.
 
         Returns
         -------
         Registration
-            Its ``labels`` and ``inliers`` are rows of the correspondences of :meth:`correspond`.
+            Its ``labels`` and ``inliers`` are rows of the correspondences of :meth:`correspond`; its
+            ``warnings`` tell what is doubtful: points left out, a scan coarser than the voxel that was asked
+            for, a viewpoint that the scan contradicts, normals of the model that point inwards, and, where
+            nothing is found, the factor between two units that would explain it. Empty, and no error, for a
+            scan that holds nothing.
 
         Raises
         ------
         InputError
             As :func:`register`; the model has no normals, neither a viewpoint nor normals are given, or the
-            scene cannot be in the unit of the model, being 10 times smaller or 300 times larger.
+            scene cannot be in the unit of the model (``check_units``).
         TypeError, ValueError
             As :func:`register`.
 
@@ -443,29 +545,33 @@ class Model:
         >>> part = ibi.Model.from_mesh(trimesh.load("part.stl"))                   # doctest: +SKIP
         >>> found = part.detect(trimesh.load("scan.ply"), viewpoint=[0, 0, 0])     # doctest: +SKIP
         """
-        matches = self.correspond(
-            tgt,
-            tgt_normals=tgt_normals,
-            viewpoint=viewpoint,
-            remove_plane=remove_plane,
-            num_threads=num_threads,
-        )
+        matches, points = self._match(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
         if params is None:
             params = Params() if viewpoint is None else Params.single_view()
+        if matches.voxel > self._voxel and isinstance(params, Params) and params.resolution is None:
+            params = params.replace(resolution=matches.voxel / _detect.VOXELS_PER_SPACING)
         if viewpoint is not None and not isinstance(viewpoint, View):
-            viewpoint = View(viewpoint, tgt)
-        return self.register(
-            matches.tgt,
-            matches.corr,
-            params,
-            tgt_normals=matches.tgt_normals,
-            similarity=matches.similarity,
-            viewpoint=viewpoint,
-            num_threads=num_threads,
-            max_instances=max_instances,
-            timeout_s=timeout_s,
-            callback=callback,
-        )
+            viewpoint = View(viewpoint, points)
+        if len(matches.corr) == 0:
+            found = _nothing(_limited(params, max_instances, timeout_s), self.spacing)
+        else:
+            found = self.register(
+                matches.tgt,
+                matches.corr,
+                params,
+                tgt_normals=matches.tgt_normals,
+                similarity=matches.similarity,
+                viewpoint=viewpoint,
+                num_threads=num_threads,
+                max_instances=max_instances,
+                timeout_s=timeout_s,
+                callback=callback,
+            )
+        found.warnings = matches.warnings
+        if len(found) == 0 and len(points) >= _doubts.ENOUGH and found.stop_reason.name not in _STOPPED:
+            doubt = _doubts.unit_warning(self.diameter, _detect.standing(points, _camera(viewpoint)[0]))
+            found.warnings += () if doubt is None else (doubt,)
+        return found
 
     def register(
         self,
@@ -486,18 +592,16 @@ class Model:
 
         Parameters, returns, raises: those of :func:`register`.
         """
-        params = params if params is not None else _DEFAULT
-        if not isinstance(params, Params):
-            raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+        params = _limited(params, max_instances, timeout_s)
         if callback is not None and not callable(callback):
             raise TypeError(f"callback must be callable, not {type(callback).__name__}")
-        overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
-        overrides = {name: value for name, value in overrides.items() if value is not None}
-        if overrides:
-            params = params.replace(**overrides)
 
         eye, measured = _camera(viewpoint)
         target, pairs, own = _points("tgt", tgt), _correspondences(corr), params._own()
+        _doubts.check_step("tgt", target)
+        if pairs.shape[1] == 6:
+            _doubts.check_step("corr", pairs[:, :3], self.spacing)
+            _doubts.check_step("corr", pairs[:, 3:])
         # Copies the scene for them, so only where there is one.
         run = Run(self._points, target, pairs, params.seed) if own else None
         raw = _core.register(
@@ -515,6 +619,36 @@ class Model:
             **({} if run is None else {name: run.stage(name, stage) for name, stage in own.items()}),
         )
         return _registration(raw, params)
+
+
+_STOPPED = ("timeout", "cancelled")
+
+
+def _limited(params: Params | None, max_instances: int | None, timeout_s: float | None) -> Params:
+    """Return the parameters of a run."""
+    params = params if params is not None else _DEFAULT
+    if not isinstance(params, Params):
+        raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+    overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
+    overrides = {name: value for name, value in overrides.items() if value is not None}
+    return params.replace(**overrides) if overrides else params
+
+
+def _nothing(params: Params, spacing: float) -> Registration:
+    """Return what a scan gives that holds nothing to register."""
+    message = f"few_correspondences: 0 alive, {_MIN_CORRESPONDENCES} needed"
+    return Registration(
+        [],
+        labels=np.empty(0, np.int32),
+        rounds="[]",
+        stop_reason=StopReason("few_correspondences", message, 0, _MIN_CORRESPONDENCES),
+        timings=Timings(*[0.0] * len(fields(Timings))),
+        resolution=spacing if params.resolution is None else params.resolution,
+        params=params,
+    )
+
+
+_MIN_CORRESPONDENCES = 3
 
 
 def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:

@@ -231,6 +231,8 @@ class Registration(Sequence[Pose]):
         pr in data units.
     params : Params
         The parameters of the run.
+    warnings : tuple of str
+        What is doubtful about the input, one line each: :meth:`Model.detect` looks for it. Mostly empty.
     """
 
     def __init__(
@@ -243,6 +245,7 @@ class Registration(Sequence[Pose]):
         timings: Timings,
         resolution: float,
         params: Params,
+        warnings: Sequence[str] = (),
     ) -> None:
         self.poses = tuple(poses)
         self.labels = labels
@@ -251,6 +254,7 @@ class Registration(Sequence[Pose]):
         self.timings = timings
         self.resolution = resolution
         self.params = params
+        self.warnings = tuple(warnings)
 
     @cached_property
     def rounds(self) -> tuple[Round, ...]:
@@ -288,4 +292,5 @@ class Registration(Sequence[Pose]):
             f"Registration: {len(self)} {plural} in {len(self.rounds)} rounds, {self.timings.total_s:.3f} s; "
             f"stopped by {self.stop_reason}; resolution {self.resolution:.4g}"
         )
-        return "\n".join([head, *(f"  {pose!r}" for pose in self.poses)])
+        warnings = (f"  warning: {warning}" for warning in self.warnings)
+        return "\n".join([head, *warnings, *(f"  {pose!r}" for pose in self.poses)])

@@ -9,7 +9,8 @@ use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use crate::checks::{first_not_finite, unit_vectors};
 use crate::error::{Argument, Error};
 use crate::interrupt::Interrupt;
-use crate::kernels::nearby::mean_spacing;
+use crate::kernels::columns::middle;
+use crate::kernels::nearby::spacing;
 use crate::kernels::neighbors::Neighbors;
 use crate::kernels::overlap::Surface;
 use crate::kernels::rng::Rng;
@@ -99,7 +100,7 @@ pub struct PreparedCloud<'a> {
     pub viewpoint: Option<Point3<f64>>,
     /// What leaves the cloud looking the same, if that was declared.
     pub symmetries: Symmetries,
-    /// Mean distance of a point to its nearest other point, in data units.
+    /// Mean distance of a point to its nearest distinct other point, in data units; stray points do not count.
     pub spacing: f64,
     /// Diagonal of the bounding box, in data units.
     pub extent: f64,
@@ -156,7 +157,13 @@ impl<'a> PreparedCloud<'a> {
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
         }
-        let spacing = mean_spacing(points);
+        let spacing = spacing(points);
+        // Of the bulk: a stray point far off may be held as coarsely as it likes.
+        let distance = middle(points).amax();
+        let step = distance.next_up() - distance;
+        if step > MAX_STEP * spacing {
+            return Err(Error::TooFarOff { argument, distance, step, spacing });
+        }
         // A little more, for rounding.
         let radius_sq = points.iter().map(|p| (p - centre).norm_squared()).fold(0.0, f64::max);
         Ok(Self {
@@ -241,6 +248,10 @@ impl PreparedCloud<'_> {
 /// Two poses that are one: no point moves farther, in diagonals of the bounding box. Parts cannot lie so close, unless
 /// they are thin plates in a stack.
 const SAME_INSTANCE: f64 = 0.05;
+
+/// How far apart the numbers may be that coordinates are held in, in spacings: what is rounded so coarsely is moved by
+/// rounding. Poses are good to a few hundredths of a spacing.
+const MAX_STEP: f64 = 1e-3;
 
 /// How many points stand for a cloud: the mean of so many distances is good to a hundredth.
 pub(crate) const PROBE_POINTS: usize = 256;

@@ -100,6 +100,20 @@ pub enum Error {
         /// `src` or `tgt`.
         argument: Argument,
     },
+    /// A cloud lies so far from the origin that its coordinates cannot tell its points apart well enough.
+    #[error(
+        "the points of {argument} are {spacing:.3e} apart and its coordinates about {distance:.3e}, where numbers are {step:.3e} apart; subtract an offset"
+    )]
+    TooFarOff {
+        /// `src` or `tgt`.
+        argument: Argument,
+        /// The largest of the coordinates of its middle.
+        distance: f64,
+        /// What lies between that and the next number.
+        step: f64,
+        /// Mean distance of a point to its nearest other one; a thousandth of it is allowed.
+        spacing: f64,
+    },
     /// One cloud is smaller than the gaps between the points of the other: most likely metres against
     /// millimetres.
     #[error(

@@ -75,7 +75,7 @@ impl<'a> Clouds<'a> {
         }
         let resolution = params.resolution.unwrap_or(0.5 * (source.spacing + target.spacing));
         if resolution <= 0.0 {
-            // Points all in coincident pairs: no spacing, although there is an extent.
+            // Below what numbers can hold.
             return Err(Error::NoExtent { argument: Argument::Src });
         }
         Ok(Self { source, target, resolution })

@@ -3,6 +3,7 @@
 //! All questions in the rounds are of this kind. A kd-tree, which answers them at any distance, takes many times as
 //! long: it walks down a path of branches that no processor foresees, where eight cells are read straight through.
 
+use std::collections::HashSet;
 use std::ops::Range;
 
 use nalgebra::{Point3, Vector3};
@@ -230,6 +231,97 @@ impl WithSimd for NearestEach<'_> {
     }
 }
 
+/// How far apart the points of a cloud are: the mean distance from a point to its nearest *distinct* other point.
+///
+/// [`mean_spacing`] to the bit, unless
+///
+/// - more than [`FEW_TWINS`] of the points have a twin: one nearer than the points of a straight line could be, were they
+///   as many and as far spread, by a factor of [`TWIN`]. Then one of each set of twins counts.
+/// - points that lie more than [`STRAY`] times the median off would more than double it: far pixels of a depth camera.
+///   They do not count.
+///
+/// 0 if all points coincide.
+///
+/// # Complexity
+/// As [`mean_spacing`]; with twins twice that, and O(n) memory.
+#[must_use]
+pub fn spacing(points: &[Point3<f64>]) -> f64 {
+    let (all, size) = nearest_distances(points);
+    // No cloud that hangs together has its points nearer than this: a curve is longer, a surface wider.
+    let on_a_line = size / points.len() as f64;
+    let have_twins = |distances: &[f64]| {
+        let twins = distances.iter().filter(|&&distance| distance <= on_a_line / TWIN).count();
+        twins as f64 > FEW_TWINS * distances.len() as f64
+    };
+    if !have_twins(&all) {
+        return mean_without_strays(all);
+    }
+    let copies = one_of_each(points, |p| [0, 1, 2].map(|axis| (p[axis] + 0.0).to_bits()));
+    let (distances, _) = nearest_distances(&copies);
+    let cell = on_a_line * (MERGED / TWIN);
+    if have_twins(&distances) && cell > 0.0 {
+        let middle = middle(points);
+        // A cast saturates: far strays are one.
+        let cell_of = |p: &Point3<f64>, shift: f64| {
+            [0, 1, 2].map(|axis| ((p[axis] - middle[axis]) / cell + shift).floor() as i64)
+        };
+        // Twice, on lattices half a cell apart: a face of the part may lie in the border of one.
+        let merged = one_of_each(&copies, |p| cell_of(p, 0.25));
+        let merged = one_of_each(&merged, |p| cell_of(p, 0.75));
+        let spacing = mean_without_strays(nearest_distances(&merged).0);
+        // Else they are no twins: small, dense bodies that are far apart.
+        if merged.len() >= copies.len() / MOST_TWINS && spacing >= GAP * cell {
+            return spacing;
+        }
+    }
+    mean_without_strays(distances)
+}
+
+/// Twins are nearer than points on a straight line by this factor. Of points at random on a line less than
+/// [`FEW_TWINS`] are so near to each other; of those on a surface next to none.
+const TWIN: f64 = 256.0;
+
+/// Share of points that may have a twin: their spacing counts all the same, as it changes the mean by no more.
+const FEW_TWINS: f64 = 0.05;
+
+/// How wide the cells are that twins are merged in, in distances at which points are twins: few pairs lie astride.
+const MERGED: f64 = 16.0;
+
+/// The least spacing of merged points, in such cells. On a line of twins it is 32.
+const GAP: f64 = 8.0;
+
+/// So many points that nearly coincide, on average, are taken for one; of points that do any number.
+const MOST_TWINS: usize = 8;
+
+/// In medians: a point whose nearest is farther away is a stray one.
+const STRAY: f64 = 32.0;
+
+/// The first of the points with each key, in their order.
+fn one_of_each<K: Eq + std::hash::Hash>(
+    points: &[Point3<f64>],
+    key: impl Fn(&Point3<f64>) -> K,
+) -> Vec<Point3<f64>> {
+    let mut seen = HashSet::with_capacity(points.len());
+    points.iter().filter(|p| seen.insert(key(p))).copied().collect()
+}
+
+/// The mean of the distances, without those far above the median if they would more than double it; 0 if there are none.
+fn mean_without_strays(mut distances: Vec<f64>) -> f64 {
+    let mean = |distances: &[f64]| {
+        if distances.is_empty() { 0.0 } else { distances.iter().sum::<f64>() / distances.len() as f64 }
+    };
+    let of_all = mean(&distances);
+    let half = distances.len() / 2;
+    let mut sorted = distances.clone();
+    if sorted.is_empty() {
+        return of_all;
+    }
+    let most = STRAY * *sorted.select_nth_unstable_by(half, f64::total_cmp).1;
+    distances.retain(|&distance| distance <= most);
+    let of_most = mean(&distances);
+    if of_all > 2.0 * of_most { of_most } else { of_all }
+}
+
 /// The mean distance from a point to its nearest other point; 0 for fewer than two points. Points that coincide are 0
 /// apart. Of more than 8192 points so many are asked, drawn at random but always the same ones: then the
 /// mean is good to a hundredth.
@@ -238,9 +330,16 @@ impl WithSimd for NearestEach<'_> {
 /// O(n) for points that fill a surface or a volume.
 #[must_use]
 pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
+    let (distances, _) = nearest_distances(points);
+    if distances.is_empty() { 0.0 } else { distances.iter().sum::<f64>() / distances.len() as f64 }
+}
+
+/// What [`mean_spacing`] is the mean of, none for fewer than two points; and the diagonal of the box around the bulk of
+/// the points.
+fn nearest_distances(points: &[Point3<f64>]) -> (Vec<f64>, f64) {
     let n = points.len();
     if n < 2 {
-        return 0.0;
+        return (Vec::new(), 0.0);
     }
     let middle = middle(points);
     let unit = points.iter().map(|p| (p.coords - middle).amax()).fold(0.0, f64::max).max(f64::MIN_POSITIVE);
@@ -249,19 +348,20 @@ pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
     // questions tell how much finer they should be.
     let bounds = rows.each_ref().map(|axis| bulk(axis));
     let widest = bounds.iter().fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
+    let size = unit * Vector3::from(bounds.map(|(low, high)| f64::from(high - low))).norm();
     let sorted = |cell| Sorted::new(&rows, Grid::in_box(&rows, bounds, cell));
     let coarse = sorted(widest / (n as f32 / POINTS_PER_CELL).cbrt());
     let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE));
     guess.sort_unstable_by(f64::total_cmp);
     // The median: a few far points must not make the cells of all others wide.
     let cell = CELL_PER_SPACING * (guess[guess.len() / 2] / unit) as f32;
-    let spacings = if cell < 0.7 * coarse.grid.cell_size() {
+    let distances = if cell < 0.7 * coarse.grid.cell_size() {
         let fine = sorted(cell);
         fine.spacings(Some(&coarse), points, &fine.strata(SPACING_SAMPLE))
     } else {
         coarse.spacings(None, points, &coarse.strata(SPACING_SAMPLE))
     };
-    spacings.iter().sum::<f64>() / spacings.len() as f64
+    (distances, size)
 }
 
 /// About how many points a cell of the first grid would hold if they filled a volume.

@@ -129,18 +129,6 @@ fn clouds_must_have_three_points_at_two_places() {
 }
 
 #[test]
-fn clouds_of_nothing_but_coincident_pairs_have_no_resolution_unless_it_is_given() {
-    let twice = |points: &mut Vec<Point3<f64>>| *points = [&points[..], &points[..]].concat();
-    let mut scene = easy();
-    twice(&mut scene.source);
-    twice(&mut scene.target);
-    let mut input = Input::of(&scene);
-    assert!(matches!(input.register(), Err(Error::NoExtent { .. })));
-    input.params.resolution = Some(0.15);
-    assert!(!input.register().unwrap().poses.is_empty());
-}
-
-#[test]
 fn clouds_must_be_in_the_same_unit() {
     let scene = easy();
     let in_mm = |points: &mut Vec<Point3<f64>>| points.iter_mut().for_each(|p| p.coords *= 1000.0);
