@@ -214,6 +214,7 @@ def test_no_jobs_give_no_results():
         ({"executor": "3"}, TypeError, "executor must be a concurrent.futures.Executor .* not str"),
         ({"executor": 0}, ibi.InputError, "executor is 0; it must be at least 1"),
         ({"executor": True}, TypeError, "executor must be an integer, not bool"),
+        ({"executor": dict}, TypeError, "executor must make a concurrent.futures.Executor, not dict"),
         ({"callback": 3}, TypeError, "callback must be callable, not int"),
         ({"window": 0}, ibi.InputError, "window is 0; it must be at least 1"),
         ({"retries": -1}, ibi.InputError, "retries is -1; it must be at least 0"),

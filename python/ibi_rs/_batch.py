@@ -23,6 +23,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import io
@@ -285,10 +286,12 @@ def register_batch(
     """
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be callable, not {type(callback).__name__}")
+    if not isinstance(jobs, Iterable):
+        raise TypeError(f"jobs must be an iterable of ibi_rs.Job, not {type(jobs).__name__}")
     threads = None if num_threads is None else _num_threads(num_threads)
     stop = threading.Event()
     make: Callable[[], Executor]
-    if executor is None or isinstance(executor, int):
+    if executor is None or isinstance(executor, (int, np.integer)):
         most = None if executor is None else _count("executor", executor, 1)
         workers, threads = _share(_cores(), operator.length_hint(jobs, 2**31), threads, most)
         make, default = functools.partial(ThreadPoolExecutor, workers, "ibi-batch"), 4 * workers
@@ -297,7 +300,7 @@ def register_batch(
         if isinstance(executor, Executor):
             make = functools.partial(_given, executor)
         elif callable(executor):
-            make = executor
+            make = functools.partial(_made, executor)
         else:
             raise TypeError(
                 "executor must be a concurrent.futures.Executor (of Dask client.get_executor(), of Ray "
@@ -321,6 +324,15 @@ def register_batch(
 
 def _given(executor: Executor) -> Executor:
     return executor
+
+
+def _made(make: Callable[[], Executor]) -> Executor:
+    made = make()
+    if not isinstance(made, Executor):
+        raise TypeError(
+            f"executor must make a concurrent.futures.Executor, not {type(made).__name__}, when it is called"
+        )
+    return made
 
 
 def _run(

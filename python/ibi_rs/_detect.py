@@ -84,7 +84,13 @@ def scene_points(
     num_threads: int | None,
 ) -> tuple[Floats, Floats]:
     """Points of a scan, one a voxel, without the table, and their normals."""
-    tgt, tgt_normals = features.voxel_downsample(points, voxel, normals=normals)
+    try:
+        tgt, tgt_normals = features.voxel_downsample(points, voxel, normals=normals)
+    except _core.InputError as error:  # under the names that the caller gave them by
+        named = str(error).replace("rows of points", "rows of tgt")
+        for name, called in (("points", "tgt"), ("normals", "tgt_normals")):
+            named = called + named.removeprefix(name) if named.startswith(name) else named
+        raise _core.InputError(named) from None
     if remove_plane is not False:
         on_plane = _table(tgt, voxel, viewpoint, is_sure=remove_plane is True)
         tgt = tgt[~on_plane]
