@@ -251,7 +251,7 @@ def register_batch(
         on are errors. Ray and Dask run jobs again by settings of their own, before they give them up.
     callback : callable, optional
         Called with the job's index and its result as soon as a job ends, in any order; in the thread that
-        asks for results.
+        asks for results. What it raises ends the batch.
 
     Yields
     ------
@@ -481,15 +481,18 @@ class _Batch(Generic[_T, _R]):
             ended, _ = wait(self._running, _TICK_S, FIRST_COMPLETED)
             for future in ended:
                 task = self._running.pop(future)
+                value: _R | JobError
                 try:
-                    self._finish(task, future.result())
+                    value = future.result()
                 except BrokenExecutor as death:
                     lost.append((task, death))
+                    continue
                 except Exception as error:
                     if type(error).__name__ == "KilledWorker":  # Dask's, which blames all that wait there
                         self._run_again(task, error)
-                    else:
-                        self._finish(task, self._as_value(task, error))
+                        continue
+                    value = self._as_value(task, error)
+                self._finish(task, value)  # out here: what the callback raises is no error of the job
             if ended and not lost:
                 return
         for task, cause in sorted(lost, key=lambda pair: pair[0].index):

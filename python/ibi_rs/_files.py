@@ -37,7 +37,7 @@ def written(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException as error:
         with suppress(OSError):
             part.unlink()
-        if isinstance(error, OSError) and error.filename == str(part):
+        if isinstance(error, OSError) and str(error.filename) == str(part):
             error.filename = str(path)  # the name that the caller knows
         raise
 

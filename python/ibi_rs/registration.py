@@ -86,7 +86,7 @@ class Pose:
 
     def __repr__(self) -> str:
         # It does not know the resolution.
-        return self._shown(max(self.inlier_rmse, 1e-4 * np.abs(self.target_from_source[:3, 3]).max()))
+        return self._shown(max(self.inlier_rmse, 1e-7 * np.abs(self.target_from_source[:3, 3]).max()))
 
     def _shown(self, scale: float) -> str:
         """In a line, with lengths that are rounded by a scale."""

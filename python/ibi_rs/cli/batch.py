@@ -38,6 +38,7 @@ from .common import (
     err,
     misused,
     out,
+    print_table,
     say,
     sha256,
     try_outputs,
@@ -134,7 +135,7 @@ def batch(
     def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
         i, job = new[number], todo[number]
         if not isinstance(found, ibi.JobError):
-            found = found.canonical(part.symmetries)
+            found = found if part.symmetries.is_none else found.canonical(part.symmetries)
             for warning in warnings_of(found):
                 warn(f"{scenes[i]}: {warning}")
         outcome = _outcome(job, found)
@@ -356,7 +357,7 @@ def _show_batch(scenes: list[Path], outcomes: dict[int, _Outcome], seconds: floa
         best = f"{max(one.scores):.2f}" if one.scores else ""
         cells = ("", "", "") if one.has_failed else (str(len(one.scores)), best, f"{one.seconds:.2f}")
         table.add_row(escape(str(scene)), *cells, note)
-    out.print(table)
+    print_table(table)
     failed = sum(one.has_failed for one in outcomes.values())
     found = sum(len(one.scores) for one in outcomes.values())
     missing = len(scenes) - len(outcomes)

@@ -32,6 +32,7 @@ from .common import (
     err,
     misused,
     out,
+    print_table,
     try_outputs,
     write_json,
 )
@@ -208,7 +209,7 @@ def _show_bench(data: dict[str, Any]) -> None:
             of = steps[step]
             cells += [f"{x:.4f}" for x in (statistics.median(of), min(of), max(of))]
         table.add_row(f"  {step}" if step in STAGES.values() else step, *cells)
-    out.print(table)
+    print_table(table)
     runs = f"{data['num_poses']} found; {data['repeats']} runs of {data['model']}, {data['scene']}"
     out.print(runs, highlight=False, markup=False)
     versions = f"ibi_rs {data['ibi_rs']}, Python {data['python']}, numpy {data['numpy']}"

@@ -27,6 +27,7 @@ from ibi_rs.symmetries import _bop_entry as bop_entry
 try:
     import typer
     from rich.console import Console
+    from rich.measure import Measurement
     from rich.table import Table
     from typer.core import TyperCommand, TyperGroup
 except ImportError as error:
@@ -144,14 +145,20 @@ def reason(error: object) -> str:
     """Say what is wrong in one line, which names the file where there is one."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    # Ours have one line; but a file may have a name of two.
+    return " ".join(lines) if isinstance(error, (ibi.InputError, ibi.ParamsError)) else lines[0]
 
 
 def say(text: str) -> None:
     """Print a line on stderr."""
-    line = " ".join(text.splitlines())
-    err.print(f"ibi: {line}", highlight=False, markup=False, soft_wrap=True)
+    line = f"ibi: {' '.join(text.splitlines())}"
+    if err.is_terminal:
+        err.print(line, highlight=False, markup=False, soft_wrap=True)  # above a bar
+    elif sys.stderr is not None:
+        with suppress(OSError):  # nobody reads it
+            # Rich would print it again with the next, if Ctrl-C came in between.
+            print(line, file=sys.stderr, flush=True)
 
 
 def warn(text: str) -> None:
@@ -378,13 +385,21 @@ def show(found: ibi.Registration, seconds: float) -> None:
         quality = [f"{pose.score:.2f}", f"{pose.overlap:.2f}", str(pose.num_inliers)]
         table.add_row(str(number), *quality, *place, *turn)
     if len(found):
-        out.print(table)
+        print_table(table)
         out.print("x, y, z in the unit of the scene; rx, ry, rz: rotation vector, degrees", style="dim")
     out.print(
         f"{len(found)} found in {seconds:.2f} s; stopped by {found.stop_reason}",
         highlight=False,
         markup=False,
     )
+
+
+def print_table(table: Table) -> None:
+    """Print a table as wide as it has to be: half a number is none, and half a path in a pipe."""
+    needed = Measurement.get(out, out.options.update(width=10_000), table).maximum
+    is_folded = any(column.overflow == "fold" for column in table.columns) and out.is_terminal
+    console = out if is_folded else _Console(emoji=False, width=max(needed, out.width))
+    console.print(table, crop=False)
 
 
 def _rotation_vector(rotation: Any) -> Any:

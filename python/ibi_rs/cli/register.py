@@ -120,7 +120,8 @@ def register(
                 **options,
             )
     seconds = time.perf_counter() - start
-    found = found.canonical(held)
+    if not held.is_none:
+        found = found.canonical(held)
     for warning in warnings_of(found):
         warn(warning)
     show(found, seconds)
@@ -139,6 +140,7 @@ def register(
         write_bop(bop, [(0, 0, np.asarray(found), [pose.score for pose in found], seconds)])
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
+        title = title.encode(errors="replace").decode()  # names of files may be of any bytes
         ibi.plot.instances(tgt, src, found, plot, title=title)
     if rerun is not None:
         if corr is None:  # once more, as `detect` keeps them to itself
