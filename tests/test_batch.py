@@ -187,6 +187,19 @@ def test_results_wait_for_their_turn_and_progress_does_not():
     assert all(found[index] is value for index, value in told)
 
 
+def test_what_the_callback_raises_ends_the_batch():
+    told = []
+
+    def full(index, found):
+        told.append((index, found))
+        raise OSError("the disk is full")
+
+    with pytest.raises(OSError, match="the disk is full"):
+        list(ibi.register_batch(JOBS[:2], 1, callback=full))
+    ((index, found),) = told  # once, and not as an error of the job
+    assert (index, content(found)) == (0, EXPECTED[0])
+
+
 def test_cores_are_shared_and_not_oversubscribed(monkeypatch):
     assert _batch._share(8, 100, None, None) == (8, 1)
     assert _batch._share(8, 3, None, None) == (3, 2)
@@ -214,6 +227,7 @@ def test_no_jobs_give_no_results():
         ({"executor": "3"}, TypeError, "executor must be a concurrent.futures.Executor .* not str"),
         ({"executor": 0}, ibi.InputError, "executor is 0; it must be at least 1"),
         ({"executor": True}, TypeError, "executor must be an integer, not bool"),
+        ({"jobs": 3}, TypeError, "jobs must be an iterable of ibi_rs.Job, not int"),
         ({"callback": 3}, TypeError, "callback must be callable, not int"),
         ({"window": 0}, ibi.InputError, "window is 0; it must be at least 1"),
         ({"retries": -1}, ibi.InputError, "retries is -1; it must be at least 0"),
@@ -222,7 +236,13 @@ def test_no_jobs_give_no_results():
 )
 def test_arguments_are_refused_at_once(options, kind, message):
     with pytest.raises(kind, match=message):
-        ibi.register_batch([], **options)
+        ibi.register_batch(**{"jobs": [], **options})
+
+
+def test_what_an_executor_is_made_by_must_make_one():
+    with pytest.raises(TypeError, match=r"^executor must make a concurrent\.futures\.Executor, not dict"):
+        list(ibi.register_batch(JOBS[:1], dict))
+    assert values(JOBS[:2], np.int64(2)) == EXPECTED[:2]
 
 
 def test_a_job_refuses_what_has_no_say():

@@ -169,6 +169,10 @@ def test_words_stand_for_stages():
         assert getattr(params, stage) == variant()
         assert PLAIN.replace(**{stage: variant.variant}) == params
         assert ibi.Params.from_dict({stage: variant.variant}) == params
+        for quoted in (f"'{variant.variant}'", f'"{variant.variant}"', f'"""{variant.variant}"""'):
+            assert ibi.Params.from_toml(f"t_s = 4\n{stage} = {quoted} # that") == params
+    words = 'te = "mac"\nscs = "gtm"\nhv="none"\n[ce]\nvariant = "off"'
+    assert ibi.Params.from_toml(words) == ibi.Params(te="mac", scs="gtm", hv="none", ce="off")
 
 
 def test_params_are_frozen_values():
@@ -239,6 +243,8 @@ REFUSED = [
     ({"refine": "off"}, "params.refine is 'off'; it must be one of 'none', 'icp'"),
     ({"n_contest": 0}, "params.n_contest is 0; it must be at least 1"),
     ({"joint_check": "yes"}, f"params.joint_check is 'yes'; {BOOL}"),
+    ({"refine": np.array(["icp", "none"])}, "params.refine is array(['icp', 'none']"),
+    ({"scs": ibi.Gtm(payoff=np.array([1, 2]))}, "params.scs.payoff is array([1, 2]); it must be one of"),
     ({"removal": "all"}, "params.removal is 'all'; it must be one of 'dense'"),
     ({"max_rejections": -1}, f"params.max_rejections is -1; {INT}"),
     ({"max_rejections": "none"}, f"params.max_rejections is 'none'; {INT}"),
@@ -316,6 +322,7 @@ DATA = [
     ({"te": None}, "params.te is None; it must be one of 'gsac', "),
     ({"te": {"variant": "g"}}, "params.te is 'g'; it must be one of 'gsac', "),
     ({"te": {"variant": ["gsac"]}}, "params.te is ['gsac']; it must be one of 'gsac', "),
+    ({"te": {"variant": np.array([1, 2])}}, "params.te is array([1, 2]); it must be one of 'gsac', "),
     ({"te": {"variant": "gsac", "n_gsac": "5"}}, f"params.te.n_gsac is '5'; {INT}"),
     ({"seed": {}}, f"params.seed is {{}}; {INT}"),
     ({"t_he_pr": [3]}, f"params.t_he_pr is [3]; {FLOAT}"),
@@ -342,6 +349,10 @@ TOML = [
     ('t_s = "none"', "line 1"),
     ("seed == 1", "line 1"),
     ('[ce]\nvariant = "of"', "`of`"),
+    ('\nce = "of"', "line 2"),
+    ('\nce = "of"', "`of`"),
+    ("ce = 3", "line 1"),
+    ('ce = "off"\n\nseed = -1', "line 3"),
     ('[scs]\nvariant = "gtm"\nn_gmt = 1', "`n_gmt`"),
 ]
 
@@ -366,10 +377,41 @@ def test_a_bad_file_is_named(tmp_path, name, text):
 
 def test_a_file_says_its_format_by_its_name(tmp_path):
     for action in (PLAIN.save, ibi.Params.load):
-        with pytest.raises(ValueError, match=r"params\.yaml: a parameter file must end in \.toml or \.json"):
+        with pytest.raises(
+            ibi.ParamsError, match=r"params\.yaml: a parameter file must end in \.toml or \.json"
+        ):
             action(tmp_path / "params.yaml")
     with pytest.raises(FileNotFoundError):
         ibi.Params.load(tmp_path / "missing.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[]", "must be a JSON object, not []"),
+        ("3", "must be a JSON object, not 3"),
+        ("null", "must be a JSON object, not None"),
+        ("NaN", "must be a JSON object, not nan"),
+        ("", "is no JSON: "),
+        ('{"t_s": 4', "is no JSON: "),
+        ("[" * 100_000, "it is nested too deeply"),
+        ('{"a":' * 100_000, "it is nested too deeply"),
+        ('{"scs": null}', "params.scs is None; it must be one of 'gtm'"),
+    ],
+)
+def test_json_that_holds_no_parameters_is_refused_with_its_name(tmp_path, text, message):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(ibi.ParamsError) as caught:
+        ibi.Params.load(path)
+    assert str(caught.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_may_begin_with_a_mark_of_its_encoding(tmp_path):
+    for name, text in (("p.json", '{"t_s": 6}'), ("p.toml", "t_s = 6")):
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+        assert ibi.Params.load(tmp_path / name) == ibi.Params(t_s=6)
 
 
 @pytest.mark.parametrize("data", [None, 3, [("t_s", 5)], "t_s"])

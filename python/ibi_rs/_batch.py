@@ -23,6 +23,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import io
@@ -250,7 +251,7 @@ def register_batch(
         on are errors. Ray and Dask run jobs again by settings of their own, before they give them up.
     callback : callable, optional
         Called with the job's index and its result as soon as a job ends, in any order; in the thread that
-        asks for results.
+        asks for results. What it raises ends the batch.
 
     Yields
     ------
@@ -285,10 +286,12 @@ def register_batch(
     """
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be callable, not {type(callback).__name__}")
+    if not isinstance(jobs, Iterable):
+        raise TypeError(f"jobs must be an iterable of ibi_rs.Job, not {type(jobs).__name__}")
     threads = None if num_threads is None else _num_threads(num_threads)
     stop = threading.Event()
     make: Callable[[], Executor]
-    if executor is None or isinstance(executor, int):
+    if executor is None or isinstance(executor, (int, np.integer)):
         most = None if executor is None else _count("executor", executor, 1)
         workers, threads = _share(_cores(), operator.length_hint(jobs, 2**31), threads, most)
         make, default = functools.partial(ThreadPoolExecutor, workers, "ibi-batch"), 4 * workers
@@ -297,7 +300,7 @@ def register_batch(
         if isinstance(executor, Executor):
             make = functools.partial(_given, executor)
         elif callable(executor):
-            make = executor
+            make = functools.partial(_made, executor)
         else:
             raise TypeError(
                 "executor must be a concurrent.futures.Executor (of Dask client.get_executor(), of Ray "
@@ -321,6 +324,15 @@ def register_batch(
 
 def _given(executor: Executor) -> Executor:
     return executor
+
+
+def _made(make: Callable[[], Executor]) -> Executor:
+    made = make()
+    if not isinstance(made, Executor):
+        raise TypeError(
+            f"executor must make a concurrent.futures.Executor, not {type(made).__name__}, when it is called"
+        )
+    return made
 
 
 def _run(
@@ -469,15 +481,18 @@ class _Batch(Generic[_T, _R]):
             ended, _ = wait(self._running, _TICK_S, FIRST_COMPLETED)
             for future in ended:
                 task = self._running.pop(future)
+                value: _R | JobError
                 try:
-                    self._finish(task, future.result())
+                    value = future.result()
                 except BrokenExecutor as death:
                     lost.append((task, death))
+                    continue
                 except Exception as error:
                     if type(error).__name__ == "KilledWorker":  # Dask's, which blames all that wait there
                         self._run_again(task, error)
-                    else:
-                        self._finish(task, self._as_value(task, error))
+                        continue
+                    value = self._as_value(task, error)
+                self._finish(task, value)  # out here: what the callback raises is no error of the job
             if ended and not lost:
                 return
         for task, cause in sorted(lost, key=lambda pair: pair[0].index):

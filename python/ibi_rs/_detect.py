@@ -153,7 +153,7 @@ def scan_points(
     """Points of a scan without its table, one a voxel, and normals. The voxel is one that the scan fills."""
     given = voxel
     while True:
-        tgt, tgt_normals = features.voxel_downsample(points, voxel, normals=normals)
+        tgt, tgt_normals = _thinned(points, normals, voxel)
         on_plane, is_above = _table(tgt, voxel, diameter, viewpoint, remove_plane)
         left = tgt[~on_plane]
         spacing = _spacing(left)
@@ -176,6 +176,16 @@ def scan_points(
             left, NORMAL_VOXELS * voxel, NORMAL_NEIGHBORS, viewpoint=viewpoint, num_threads=num_threads
         )
     return Scan(left, of_left, voxel, tgt, tgt_normals, is_above)
+
+
+def _thinned(points: Floats, normals: Floats | None, voxel: float) -> tuple[Floats, Floats | None]:
+    try:
+        return features.voxel_downsample(points, voxel, normals=normals)
+    except _core.InputError as error:  # under the names that the caller gave them by
+        named = str(error).replace("rows of points", "rows of tgt")
+        for name, called in (("points", "tgt"), ("normals", "tgt_normals")):
+            named = called + named.removeprefix(name) if named.startswith(name) else named
+        raise _core.InputError(named) from None
 
 
 def standing(points: Floats, viewpoint: Any) -> list[tuple[float, int]]:

@@ -26,6 +26,7 @@ from ibi_rs._inputs import (
     _vector,
 )
 from ibi_rs._match import match
+from ibi_rs._text import significant
 from ibi_rs._view import View, _camera
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings
@@ -273,7 +274,7 @@ class Model:
         mesh = _points("vertices", vertices), _faces(faces)
         has_hand_voxel = voxel is not None
         points, normals, voxel = _detect.mesh_points(*mesh, voxel, num_threads)
-        if symmetries == "find":
+        if isinstance(symmetries, str):
             dense, of_dense, _ = _detect.mesh_points(*mesh, 0.5 * voxel, num_threads)
             symmetries = find_symmetries(dense, of_dense)
         model = cls(points, normals=normals, symmetries=symmetries)
@@ -340,7 +341,7 @@ class Model:
 
     def __repr__(self) -> str:
         normals = "with" if self._normals is not None else "without"
-        return f"Model({len(self)} points, {normals} normals, spacing {self.spacing:.4g})"
+        return f"Model({len(self)} points, {normals} normals, spacing {significant(self.spacing)})"
 
     def __getstate__(self) -> dict[str, Any]:
         state = {"points": self._points, "normals": self._normals, "frames": self._frames}
@@ -404,11 +405,14 @@ class Model:
                 "viewpoint: give it (the camera's place, [0, 0, 0] in most scans) or tgt_normals: "
                 "descriptors have to know which side of a surface is the outer one"
             )
+        if remove_plane is not None and not isinstance(remove_plane, (bool, np.bool_)):
+            raise TypeError(f"remove_plane must be a bool or None, not {type(remove_plane).__name__}")
         points, normals, num_dropped = _scan("tgt", tgt, tgt_normals)
         _doubts.check_step("tgt", points)
         if check_units:
             _doubts.check_units(self.diameter, points)
         eye = _camera(viewpoint)[0]
+        remove_plane = None if remove_plane is None else bool(remove_plane)
         scan = _detect.scan_points(
             points, normals, self._voxel, self.diameter, eye, remove_plane, num_threads
         )

@@ -95,8 +95,8 @@ class View:
         return cls(motion[:3, 3], points @ motion[:3, :3].T + motion[:3, 3])
 
     def __repr__(self) -> str:
-        x, y, z = self.eye
-        return f"View({len(self.points)} points from [{x:g}, {y:g}, {z:g}])"
+        eye = ", ".join(np.format_float_positional(x + 0.0, 9, trim="-") for x in self.eye.round(9))
+        return f"View({len(self.points)} points from [{eye}])"
 
 
 def depth_points(

@@ -755,5 +755,6 @@ def _poses(value: npt.ArrayLike, name: str) -> _Floats:
 
 
 def _check_matching(value: object) -> None:
-    if value not in ("one_to_one", "any"):
-        raise ValueError(f"matching must be 'one_to_one' or 'any', not {value!r}")
+    if not isinstance(value, str) or value not in ("one_to_one", "any"):
+        shown = " ".join(repr(value).split())
+        raise ValueError(f"matching must be 'one_to_one' or 'any', not {shown}")

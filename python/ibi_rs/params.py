@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar, get_args, get_type_hints
 import numpy as np
 
 from ibi_rs import _core, stages
+from ibi_rs._files import written
 from ibi_rs.variants import (
     Ce,
     Evidence,
@@ -211,18 +212,27 @@ class Params:
         """Write a parameter file; ``.toml`` or ``.json``."""
         path = Path(path)
         text = self.to_toml() if _is_toml(path) else json.dumps(self.to_dict(), indent=2)
-        path.write_text(text, encoding="utf-8")
+        with written(path) as part:
+            part.write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls: type[_P], path: str | os.PathLike[str]) -> _P:
-        """Read a parameter file; ``.toml`` or ``.json``."""
+        """Read a parameter file; ``.toml`` or ``.json``. ParamsError names it and what is wrong in it."""
         path = Path(path)
         is_toml = _is_toml(path)
         try:
-            text = path.read_text(encoding="utf-8")
-            return cls.from_toml(text) if is_toml else cls.from_dict(json.loads(text))
-        except ValueError as error:  # of the text, the parameters or the encoding
-            raise _core.ParamsError(f"{path}: {error}") from None
+            text = path.read_text(encoding="utf-8-sig")
+            if is_toml:
+                return cls.from_toml(text)
+            data = json.loads(text)
+            if not isinstance(data, dict):
+                raise _core.ParamsError(f"must be a JSON object, not {_shown(data)}")
+            return cls.from_dict(data)
+        except RecursionError:
+            raise _core.ParamsError(f"{path}: it is nested too deeply") from None
+        except ValueError as error:  # of the text, its encoding or the parameters
+            kind = "is no JSON: " if isinstance(error, json.JSONDecodeError) else ""
+            raise _core.ParamsError(f"{path}: {kind}{error}") from None
 
     def _own(self) -> dict[str, Callable[..., Any]]:
         """Return the stages that are callables."""
@@ -261,7 +271,7 @@ def _block(stage: str, value: Any) -> Mapping[str, Any]:
 
 def _variant(stage: str, word: Any) -> type[Any]:
     for variant in _STAGES[stage]:
-        if variant.variant == word:
+        if isinstance(word, str) and variant.variant == word:  # an array is equal to nothing and everything
             return variant
     allowed = ", ".join(repr(variant.variant) for variant in _STAGES[stage])
     raise _core.ParamsError(f"params.{stage} is {_shown(word)}; it must be one of {allowed}")
@@ -334,10 +344,10 @@ def _refusal(name: str, value: Any) -> str | None:
         return None if fine else f"an integer from 0 to {most}"
     if float in kinds:  # JSON knows neither NaN nor infinity
         return None if is_number and -1e300 < value < 1e300 else "a finite number"
-    return None if value in kinds else "one of " + ", ".join(map(repr, kinds))
+    return None if isinstance(value, str) and value in kinds else "one of " + ", ".join(map(repr, kinds))
 
 
 def _is_toml(path: Path) -> bool:
     if path.suffix not in {".toml", ".json"}:
-        raise ValueError(f"{path}: a parameter file must end in .toml or .json")
+        raise _core.ParamsError(f"{path}: a parameter file must end in .toml or .json")
     return path.suffix == ".toml"

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _interrupts
+from ibi_rs._core import InputError
+from ibi_rs._files import written
+from ibi_rs._inputs import Points, _points, _real
 
 if TYPE_CHECKING:
     from ibi_rs.registration import Registration
@@ -18,8 +22,8 @@ __all__ = ["instances"]
 
 
 def instances(
-    tgt: npt.ArrayLike,
-    src: npt.ArrayLike,
+    tgt: Points,
+    src: Points,
     registration: Registration | npt.ArrayLike,
     path: str | os.PathLike[str] | None = None,
     *,
@@ -40,7 +44,7 @@ def instances(
     registration : Registration or (K, 4, 4) array_like
         The poses; numbered from 0 as in the registration.
     path : path, optional
-        Where to save the picture; the suffix chooses the format.
+        Where to save the picture; the suffix chooses the format: ``.png``, ``.pdf``, ``.svg`` and others.
     turns_deg : sequence of float
         One view for each turn, in degrees.
     title : str, optional
@@ -52,19 +56,29 @@ def instances(
 
     Raises
     ------
+    InputError
+        An array has a wrong shape or is empty, or matplotlib writes no pictures of that suffix.
     ImportError
         If matplotlib is not installed; the message names the extra.
+    OSError
+        The picture cannot be written; then nothing of it is left.
     """
-    try:
-        with _interrupts.held():
-            from matplotlib import colormaps
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-            from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(f"pictures need matplotlib: pip install 'ibi_rs[plot]' ({error})") from error
+    picture_format = _format(path)
+    with _interrupts.held():
+        from matplotlib import colormaps
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
-    scene, model = np.asarray(tgt, np.float64), np.asarray(src, np.float64)
-    poses = np.asarray(registration, np.float64).reshape(-1, 4, 4)
+    scene, model = _points("tgt", tgt), _points("src", src)
+    for name, cloud in (("tgt", scene), ("src", model)):
+        if len(cloud) == 0:
+            raise InputError(f"{name} has 0 points; there is nothing to draw")
+    poses = np.asarray(_real("registration", registration), np.float64)
+    if poses.size and (poses.ndim != 3 or poses.shape[1:] != (4, 4)):
+        raise InputError(f"registration has shape {poses.shape}; it must be (K, 4, 4)")
+    poses = poses.reshape(-1, 4, 4)
+    if len(turns_deg) == 0:
+        raise InputError("turns_deg is empty; it must have one angle or more")
     middle = (scene.min(axis=0) + scene.max(axis=0)) / 2
     colours = colormaps["tab10" if len(poses) <= 10 else "tab20"]
 
@@ -91,5 +105,22 @@ def instances(
     if title:
         figure.suptitle(title)
     if path is not None:
-        figure.savefig(path, dpi=110)
+        with written(path) as part:
+            figure.savefig(part, dpi=110, format=picture_format)
     return figure
+
+
+def _format(path: str | os.PathLike[str] | None) -> str | None:
+    """Return the format of a picture by its suffix; raise now what would be raised after a long run."""
+    try:
+        with _interrupts.held():
+            from matplotlib.backend_bases import FigureCanvasBase
+    except ImportError as error:
+        raise ImportError(f"pictures need matplotlib: pip install 'ibi_rs[plot]' ({error})") from error
+    if path is None:
+        return None
+    known = set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"}  # which needs LaTeX
+    suffix = Path(path).suffix.lower().removeprefix(".")
+    if suffix not in known:
+        raise InputError(f"{path}: pictures are written as {', '.join(sorted(known))}, not as '{suffix}'")
+    return suffix

@@ -12,6 +12,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
+from ibi_rs._text import lengths, significant
 from ibi_rs.params import Params
 from ibi_rs.symmetries import Symmetries
 
@@ -84,10 +85,15 @@ class Pose:
         return replace(self, target_from_source=symmetries.nearest(self.target_from_source, reference))
 
     def __repr__(self) -> str:
-        t = ", ".join(f"{x:.4g}" for x in self.target_from_source[:3, 3])
+        # It does not know the resolution.
+        return self._shown(max(self.inlier_rmse, 1e-7 * np.abs(self.target_from_source[:3, 3]).max()))
+
+    def _shown(self, scale: float) -> str:
+        """In a line, with lengths that are rounded by a scale."""
+        t = ", ".join(lengths(self.target_from_source[:3, 3], scale))
         return (
             f"Pose(score={self.score:.3f}, overlap={self.overlap:.3f}, num_inliers={self.num_inliers}, "
-            f"inlier_rmse={self.inlier_rmse:.3g}, translation=[{t}])"
+            f"inlier_rmse={significant(self.inlier_rmse, 3)}, translation=[{t}])"
         )
 
 
@@ -290,7 +296,8 @@ class Registration(Sequence[Pose]):
         plural = "instance" if len(self) == 1 else "instances"
         head = (
             f"Registration: {len(self)} {plural} in {len(self.rounds)} rounds, {self.timings.total_s:.3f} s; "
-            f"stopped by {self.stop_reason}; resolution {self.resolution:.4g}"
+            f"stopped by {self.stop_reason}; resolution {significant(self.resolution)}"
         )
         warnings = (f"  warning: {warning}" for warning in self.warnings)
-        return "\n".join([head, *warnings, *(f"  {pose!r}" for pose in self.poses)])
+        poses = (f"  {pose._shown(self.resolution)}" for pose in self.poses)
+        return "\n".join([head, *warnings, *poses])

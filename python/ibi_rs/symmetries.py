@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from ibi_rs import _core
 from ibi_rs._core import InputError
+from ibi_rs._files import read_json
 from ibi_rs._inputs import Points, _aligned, _frozen, _number, _optional, _points, _real
 
 __all__ = ["Axis", "Symmetries", "find_symmetries"]
@@ -87,7 +87,9 @@ class Symmetries:
         _held: _core.Symmetries  # what the core takes; no field
 
     def __init__(self, discrete: npt.ArrayLike = (), continuous: Sequence[Any] = ()) -> None:
-        axes = [_axis(row, given) for row, given in enumerate(continuous)]
+        if not isinstance(continuous, Sequence):
+            raise TypeError(f"continuous must be a list of pairs, not {type(continuous).__name__}")
+        axes = [_axis(f"continuous[{row}]", given) for row, given in enumerate(continuous)]
         rows = (np.array([axis[k] for axis in axes], dtype=np.float64).reshape(-1, 3) for k in (0, 1))
         self._hold(_core.Symmetries(_motions("discrete", discrete), *rows))
 
@@ -131,13 +133,22 @@ class Symmetries:
         Raises
         ------
         InputError
-            The file cannot be read, has no such object or several to choose from, or declares what is no
-            symmetry.
+            The file cannot be read or is of another kind, has no such object or several to choose from, or
+            declares what is no symmetry.
         """
         entry = _bop_entry(info, obj_id)
         scale = _number("scale", scale)
+        try:
+            return cls._from_entry(entry, scale)
+        except (InputError, TypeError) as error:
+            if isinstance(info, dict):
+                raise
+            raise InputError(f"{info}: {error}") from None
+
+    @classmethod
+    def _from_entry(cls, entry: dict[str, Any], scale: float) -> Symmetries:
         motions = []
-        for row, numbers in enumerate(entry.get("symmetries_discrete", ())):
+        for row, numbers in enumerate(_listed(entry, "symmetries_discrete")):
             matrix = _real(f"symmetries_discrete[{row}]", numbers).astype(np.float64)
             if matrix.size != 16:
                 raise InputError(
@@ -147,12 +158,15 @@ class Symmetries:
             matrix[:3, 3] *= scale
             motions.append(matrix)
         lines = []
-        for row, line in enumerate(entry.get("symmetries_continuous", ())):
+        for row, line in enumerate(_listed(entry, "symmetries_continuous")):
             if not isinstance(line, dict) or not {"axis", "offset"} <= set(line):
                 raise InputError(f"symmetries_continuous[{row}] must have an 'axis' and an 'offset'")
-            axis, offset = _axis(row, (line["axis"], line["offset"]))
+            axis, offset = _axis(f"symmetries_continuous[{row}]", (line["axis"], line["offset"]))
             lines.append((axis, scale * offset))
-        return cls(motions, lines)
+        try:
+            return cls(motions, lines)
+        except InputError as error:  # of `discrete` or `continuous`
+            raise InputError(f"symmetries_{error}") from None
 
     def to_bop(self, *, scale: float = 1.0) -> dict[str, Any]:
         """Return the two entries of BOP's ``models_info.json``, those that are not empty.
@@ -326,12 +340,12 @@ def _motions(name: str, value: npt.ArrayLike) -> _Floats:
     return motions
 
 
-def _axis(row: int, given: Any) -> tuple[_Floats, _Floats]:
-    if isinstance(given, dict) or len(given) != 2:
-        raise InputError(f"continuous[{row}] must be a pair (axis, offset)")
-    arrays = [_real(f"continuous[{row}]", part) for part in given]
+def _axis(name: str, given: Any) -> tuple[_Floats, _Floats]:
+    if isinstance(given, (dict, str)) or not hasattr(given, "__len__") or len(given) != 2:
+        raise InputError(f"{name} must be a pair (axis, offset)")
+    arrays = [_real(name, part) for part in given]
     if any(array.shape != (3,) for array in arrays):
-        raise InputError(f"continuous[{row}] must be a pair of shapes (3,) and (3,)")
+        raise InputError(f"{name} must be a pair of shapes (3,) and (3,)")
     axis, offset = (array.astype(np.float64) for array in arrays)
     return axis, offset
 
@@ -343,27 +357,49 @@ def _pose(name: str, value: Any) -> _Floats:
     return _aligned(array, np.float64)
 
 
+def _listed(entry: dict[str, Any], name: str) -> list[Any]:
+    rows = entry.get(name, [])
+    if not isinstance(rows, (list, tuple, np.ndarray)):
+        raise InputError(f"{name} must be a list, not {type(rows).__name__}")
+    return list(rows)
+
+
+_BOP_KEYS = {"diameter", "symmetries_discrete", "symmetries_continuous"}
+
+
 def _bop_entry(info: dict[str, Any] | str | Path, obj_id: int | None) -> dict[str, Any]:
-    name = "info"
-    if not isinstance(info, dict):
-        name = str(info)
-        try:
-            info = json.loads(Path(info).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{name}: cannot be read: {error}") from error
-        if not isinstance(info, dict):
-            raise InputError(f"{name}: it must be a JSON object, by the numbers of the objects")
+    if isinstance(info, dict):
+        return _entry_of(info, obj_id, "info")
+    if not isinstance(info, (str, Path)):
+        raise TypeError(f"info must be a dict or a path, not {type(info).__name__}")
+    held = read_json(info)
+    if not isinstance(held, dict):
+        raise InputError(f"{info}: it must be a JSON object, by the numbers of the objects")
+    entry = _entry_of(held, obj_id, str(info))
+    if entry and not _BOP_KEYS & set(entry):
+        raise InputError(
+            f"{info}: is no models_info.json of BOP: it has none of {', '.join(sorted(_BOP_KEYS))}"
+        )
+    return entry
+
+
+def _entry_of(info: dict[str, Any], obj_id: int | None, name: str) -> dict[str, Any]:
     objects = {key: entry for key, entry in info.items() if str(key).isdecimal() and isinstance(entry, dict)}
     if not objects:
         return info
     if obj_id is None and len(objects) == 1:
         return next(iter(objects.values()))
     if obj_id is None:
-        raise InputError(f"obj_id: {name} has the objects {', '.join(map(str, objects))}; give one of them")
+        raise InputError(f"obj_id: {name} has the objects {_some(objects)}; give one of them")
     for key, entry in objects.items():
         if int(key) == obj_id:
             return entry
-    raise InputError(f"obj_id is {obj_id}; {name} has {', '.join(map(str, objects))}")
+    raise InputError(f"obj_id is {obj_id}; {name} has {_some(objects)}")
+
+
+def _some(names: dict[Any, Any]) -> str:
+    shown = ", ".join(map(str, list(names)[:20]))
+    return f"{shown}, ..." if len(names) > 20 else shown
 
 
 def _as_symmetries(value: Symmetries | npt.ArrayLike | None) -> _core.Symmetries:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ibi_rs import _interrupts
 from ibi_rs._core import InputError
+from ibi_rs._files import written
 from ibi_rs._inputs import Points, _correspondences, _count, _points
 
 if TYPE_CHECKING:
@@ -79,20 +80,43 @@ def record(
     ImportError
         Rerun is not installed; the message names the extra.
     OSError
-        The file cannot be written.
+        The file cannot be written; then nothing of it is left.
     """
-    try:
-        with _interrupts.held():
-            import rerun as rr
-    except ImportError as error:
-        raise ImportError(f"recordings need Rerun: pip install 'ibi_rs[viz]' ({error})") from error
+    rr = _rerun()
     scene, model = _points("tgt", tgt), _points("src", src)
     lines = None if corr is None else _ends(scene, model, corr, len(registration.labels))
     max_outliers = _count("max_outliers", max_outliers, 0)
-    path = Path(path)
-    path.open("wb").close()  # Rerun would only log that it cannot
-
+    for name, cloud in (("tgt", scene), ("src", model)):
+        if len(cloud) == 0:
+            raise InputError(f"{name} has 0 points; there is nothing to record")
     stream = rr.RecordingStream("ibi_rs")
+    with written(path) as part:
+        part.open("wb").close()  # Rerun would only log that it cannot
+        try:
+            _fill(rr, stream, part, scene, model, registration, lines, max_outliers)
+        finally:
+            stream.disconnect()
+
+
+def _rerun() -> Any:
+    try:
+        with _interrupts.held():
+            import rerun
+    except ImportError as error:
+        raise ImportError(f"recordings need Rerun: pip install 'ibi_rs[viz]' ({error})") from error
+    return rerun
+
+
+def _fill(
+    rr: Any,
+    stream: Any,
+    path: Path,
+    scene: npt.NDArray[np.float64],
+    model: npt.NDArray[np.float64],
+    registration: Registration,
+    lines: npt.NDArray[np.float64] | None,
+    max_outliers: int,
+) -> None:
     if hasattr(stream, "set_log_time_enabled"):  # newer than the oldest that serves
         stream.set_log_time_enabled(False)  # when and in which order it was written is of no interest
         stream.set_log_tick_enabled(False)
@@ -127,7 +151,6 @@ def record(
             stream.log("rounds/value", rr.Scalars(played.verdict.value))
             stream.log("rounds/threshold", rr.Scalars(played.verdict.threshold))
         stream.log("rounds/log", rr.TextLog(_in_words(played), level="INFO" if played.accepted else "DEBUG"))
-    stream.disconnect()
 
 
 def _blueprint() -> Any:

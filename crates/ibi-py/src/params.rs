@@ -67,7 +67,23 @@ fn nulls_to_none(value: &mut serde_json::Value) {
 
 #[pyfunction]
 fn params_from_toml(text: &str) -> PyResult<String> {
-    let params: Params = toml::from_str(text).map_err(invalid)?;
+    let params: Params = toml::from_str(&with_blocks(text)).map_err(invalid)?;
     params.validate().map_err(|e| to_py_err(&e))?;
     to_json(&params)
+}
+
+/// Makes `scs = "gtm"` a block, as `Params(scs="gtm")` does. In the text, so that errors keep their lines.
+fn with_blocks(text: &str) -> String {
+    let mut text = text.to_owned();
+    for stage in ["scs", "ce", "te", "hv"] {
+        let word = toml::de::DeTable::parse(&text).ok().and_then(|table| {
+            let value = table.get_ref().get(stage)?;
+            value.get_ref().is_str().then(|| value.span())
+        });
+        if let Some(span) = word {
+            let block = format!("{{ variant = {} }}", &text[span.clone()]);
+            text.replace_range(span, &block);
+        }
+    }
+    text
 }

@@ -1,8 +1,8 @@
 """The command `ibi`. Needs typer, rich and the readers: ``pip install 'ibi_rs[cli]'``."""
 
-from .common import FOUND_NOTHING, INTERRUPTED, app
+from .common import FOUND_NOTHING, INTERRUPTED, TERMINATED, app
 
 # Each adds itself to `app`, and stands in the help, in this order.
 from . import register, batch, evaluate, bench  # isort: skip
 
-__all__ = ["FOUND_NOTHING", "INTERRUPTED", "app", "batch", "bench", "evaluate", "register"]
+__all__ = ["FOUND_NOTHING", "INTERRUPTED", "TERMINATED", "app", "batch", "bench", "evaluate", "register"]

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 import ibi_rs as ibi
+from ibi_rs._files import read_json, try_writing
 
 from .common import (
-    ERRORS,
-    INTERRUPTED,
+    MAX_THREADS,
     FromAllSides,
     MaxInstances,
     ModelFile,
@@ -32,25 +32,31 @@ from .common import (
     TimeoutS,
     Viewpoint,
     Voxel,
-    app,
     as_dict,
     chosen_params,
+    command,
     err,
-    fail,
+    misused,
     out,
+    print_table,
+    say,
+    sha256,
+    try_outputs,
+    warn,
+    warnings_of,
     write_bop,
     write_json,
 )
 
 
-@app.command()
+@command()
 def batch(
     model: ModelFile,
     scenes: Annotated[
         list[Path],
         typer.Argument(help="Scans, of any kind that `register` reads.", metavar="SCENES"),
     ],
-    viewpoint: Viewpoint = (0.0, 0.0, 0.0),
+    viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
@@ -60,10 +66,11 @@ def batch(
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Scans at a time. Default: one for each core.")
+        int | None, typer.Option(min=1, max=MAX_THREADS, help="Scans at a time. Default: one for each core.")
     ] = None,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="Of each scan. Default: what shares the cores among them.")
+        int | None,
+        typer.Option(min=1, max=MAX_THREADS, help="Of each scan. Default: what shares the cores among them."),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the poses: a JSON for each scan.")
@@ -71,9 +78,13 @@ def batch(
     bop: Annotated[
         Path | None, typer.Option(help="All poses as BOP's CSV: t in mm, if the unit is the metre.")
     ] = None,
-    obj_id: Annotated[int, typer.Option(help="obj_id in the CSV.")] = 1,
+    obj_id: Annotated[int, typer.Option(min=0, help="obj_id in the CSV.")] = 1,
     skip_existing: Annotated[
-        bool, typer.Option("--skip-existing", help="Leave out scans whose JSON is there: resume a batch.")
+        bool,
+        typer.Option(
+            "--skip-existing",
+            help="Leave out scans whose JSON is there and would come out the same: resume a batch.",
+        ),
     ] = False,
 ) -> None:
     """Find the parts MODEL in each of SCENES, several at a time.
@@ -82,71 +93,89 @@ def batch(
 
     Go on after a stop:     the same with --skip-existing
 
-    poses/NAME.json is what `ibi register -o` writes of scans/NAME.ply.
+    poses/NAME.json is what `ibi register -o` writes of scans/NAME.ply. It says
+    what it was made of and how: with --skip-existing a scan is done again whose
+    content, MODEL, parameters or options are others now, and a line says why.
 
     In the CSV im_id is the last number in a scan's name (scan_0012.ply: 12),
     and scene_id the name of its folder where that is a number, as in BOP
     (000003/), else 0. Where a scan has no number, or two have the same, im_id
     counts the scans from 0.
 
-    A scan that fails costs one line and no other scan.
+    A scan that fails costs one line and no other scan. After Ctrl-C the table
+    is of the scans that are done; the CSV is not written.
 
     Exit code: 0 if none failed, found or not; 1 if any did, or MODEL cannot be
     used; 2 if the command line is at fault; 130 after Ctrl-C.
     """
     if skip_existing and output is None:
-        fail("--skip-existing looks into the folder of -o; give it")
+        misused("--skip-existing looks into the folder of -o; give it")
     chosen = chosen_params(preset, params)
     search = Search(
         viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries
     )
     start = time.perf_counter()
+    targets = _targets(scenes, output)
+    try_outputs(
+        {"--bop": bop}, {"MODEL": model, "--params": params} | {f"scan {scene}": scene for scene in scenes}
+    )
+    _try_folder(output, targets)
+    part = search.model(model, None)
+    of_model: dict[str, Any] = {"model": model, "model_sha256": sha256(model)}
+    recorded = search.recorded(part.symmetries)
+    outcomes: dict[int, _Outcome] = {}
+    if skip_existing:
+        for i, old in _kept(scenes, targets, of_model, recorded, search.params_for()):
+            outcomes[i] = old
+    new = [i for i in range(len(scenes)) if i not in outcomes]
+    # Without a viewpoint a job takes the normals of its file.
+    options = search.sight(None) | search.limits(None)
+    todo = [_TimedJob(part, scenes[i], params=chosen, **options) for i in new]
+
+    def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
+        i, job = new[number], todo[number]
+        if not isinstance(found, ibi.JobError):
+            found = found if part.symmetries.is_none else found.canonical(part.symmetries)
+            for warning in warnings_of(found):
+                warn(f"{scenes[i]}: {warning}")
+        outcome = _outcome(job, found)
+        target = targets[i]
+        if target is not None and not isinstance(found, ibi.JobError):
+            of_scene: dict[str, Any] = {"scene": scenes[i], "scene_sha256": job.sha256[-1]}
+            write_json(target, as_dict(found, outcome.seconds, **of_model, **of_scene, search=recorded))
+        outcomes[i] = outcome
+
     try:
-        targets = _targets(scenes, output)
-        if output is not None:
-            output.mkdir(parents=True, exist_ok=True)
-        outcomes = {i: old for i, target in enumerate(targets) if skip_existing and (old := _old(target))}
-        new = [i for i in range(len(scenes)) if i not in outcomes]
-        part = search.model(model, None)
-        # Without a viewpoint a job takes the normals of its file.
-        options = search.sight(None) | search.limits(None)
-        todo = [_TimedJob(part, scenes[i], params=chosen, **options) for i in new]
-
-        def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
-            i = new[number]
-            if not isinstance(found, ibi.JobError):
-                found = found.canonical(part.symmetries)
-            outcome = _outcome(todo[number], found)
-            target = targets[i]
-            if target is not None and not isinstance(found, ibi.JobError):
-                write_json(target, as_dict(found, model, scenes[i], outcome.seconds))
-            outcomes[i] = outcome
-
         _run_all(todo, jobs, threads, keep)
-        _show_batch(scenes, outcomes, time.perf_counter() - start)
-        if bop is not None:
-            ids = _bop_ids(scenes)
-            write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id)
-    except ERRORS as error:
-        fail(error)
     except KeyboardInterrupt:
-        hint = "; with --skip-existing the batch goes on from here" if output is not None else ""
-        err.print(f"ibi: interrupted{hint}", highlight=False, markup=False, soft_wrap=True)
-        raise typer.Exit(INTERRUPTED) from None
+        _show_batch(scenes, outcomes, time.perf_counter() - start)
+        if output is not None:
+            say("with --skip-existing the batch goes on from here")
+        raise
+    except Exception:  # a JSON that cannot be written
+        _show_batch(scenes, outcomes, time.perf_counter() - start)
+        raise
+    _show_batch(scenes, outcomes, time.perf_counter() - start)
+    if bop is not None:
+        ids = _bop_ids(scenes)
+        write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id)
     if any(one.has_failed for one in outcomes.values()):
         raise typer.Exit(1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class _TimedJob(ibi.Job):
-    """Remembers how long it took, reading included; in threads of this process, which share it."""
+    """Remembers of what and how long, reading included; in threads of this process, which share it."""
 
     seconds: list[float] = field(default_factory=list, kw_only=True)
+    sha256: list[str] = field(default_factory=list, kw_only=True)
 
     def run(self, **options: Any) -> ibi.Registration:
         start = time.perf_counter()
         found = super().run(**options)
         self.seconds.append(time.perf_counter() - start)
+        assert self.path is not None
+        self.sha256.append(sha256(self.path))
         return found
 
 
@@ -186,8 +215,7 @@ def _run_all(
         def ended(number: int, found: ibi.Registration | ibi.JobError) -> None:
             if isinstance(found, ibi.JobError):
                 name = "" if str(found.name) in found.reason else f"{found.name}: "
-                line = f"ibi: {name}{found.reason}"
-                progress.console.print(line, highlight=False, markup=False, soft_wrap=True)
+                say(f"{name}{found.reason}")  # above the bar, which is on this console
             keep(number, found)
             progress.advance(bar)
 
@@ -207,15 +235,102 @@ def _targets(scenes: list[Path], folder: Path | None) -> list[Path | None]:
     return list(targets)
 
 
-def _old(target: Path | None) -> _Outcome | None:
-    """Read what a batch before has written; None if there is none, or none that can be read."""
+def _try_folder(folder: Path | None, targets: list[Path | None]) -> None:
+    """Make the folder, and see that it can be written to, before anything is run."""
+    if folder is None:
+        return
+    if folder.exists() and not folder.is_dir():
+        raise ibi.InputError(f"{folder}: is no folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for target in targets:
+        if target is not None and (target.exists() or target == targets[0]):
+            try_writing(target)
+
+
+def _kept(
+    scenes: list[Path],
+    targets: list[Path | None],
+    of_model: dict[str, Any],
+    search: dict[str, Any],
+    params: ibi.Params,
+) -> Iterator[tuple[int, _Outcome]]:
+    """Give what a batch before has written and this one would write again; say of the rest why not."""
+    for i, target in enumerate(targets):
+        if target is None or not target.exists():
+            continue
+        try:
+            data = read_json(target)
+            outcome = _old(data)
+            why = _difference(data, scenes[i], of_model, search, params)
+        except (ibi.InputError, KeyError, TypeError, ValueError, AttributeError):
+            why = "cannot be read"
+        if why is None:
+            yield i, outcome
+        else:
+            say(f"{target.name}: {why}; done again")
+
+
+def _old(data: dict[str, Any]) -> _Outcome:
+    scores = [float(pose["score"]) for pose in data["poses"]]
+    poses = np.array([pose["target_from_source"] for pose in data["poses"]], np.float64)
+    return _Outcome(poses.reshape(len(scores), 4, 4), scores, float(data["seconds"]), is_old=True)
+
+
+def _difference(
+    data: dict[str, Any],
+    scene: Path,
+    of_model: dict[str, Any],
+    search: dict[str, Any],
+    params: ibi.Params,
+) -> str | None:
+    """Say in what an old result differs from what would be found now; None if in nothing."""
+    if not {"model_sha256", "scene_sha256", "search", "params"} <= set(data):
+        return "made by an older ibi, which did not write down of what and how"
+    if data["model_sha256"] != of_model["model_sha256"]:
+        return f"made of another model ({_other(data['model'], of_model['model'])})"
     try:
-        data = json.loads(target.read_text(encoding="utf-8")) if target is not None else {}
-        scores = [float(pose["score"]) for pose in data["poses"]]
-        poses = np.array([pose["target_from_source"] for pose in data["poses"]], np.float64)
-        return _Outcome(poses.reshape(-1, 4, 4), scores, float(data.get("seconds", 0)), is_old=True)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+        if data["scene_sha256"] != sha256(scene):
+            return f"made of another scan ({_other(data['scene'], scene)})"
+    except OSError as error:
+        return f"{scene} cannot be read: {error.strerror}"
+    for kind, old, now in (
+        ("options", data["search"], search),
+        ("parameters", data["params"], params.to_dict()),
+    ):
+        changes = list(_changes(old, now))
+        if changes:
+            more = f" and {len(changes) - 3} more" if len(changes) > 3 else ""
+            return f"made with other {kind} ({', '.join(changes[:3])}{more})"
+    return None
+
+
+def _other(old: Any, now: Path) -> str:
+    return f"{now} has changed" if str(old) == str(now) else f"{old} for {now}"
+
+
+def _changes(old: dict[str, Any], now: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """Name what two nested dicts differ in: 'hv.t_score 0.9 for 0.5'."""
+    for key in dict.fromkeys([*now, *old]):
+        name, was, wanted = f"{prefix}{key}", old.get(key), now.get(key)
+        if was == wanted:
+            continue
+        if key == "symmetries":
+            yield "other symmetries"
+        elif isinstance(was, dict) and isinstance(wanted, dict):
+            if was.get("variant") != wanted.get("variant"):  # whose parameters have nothing in common
+                yield f"{name} {was.get('variant')} for {wanted.get('variant')}"
+            else:
+                yield from _changes(was, wanted, f"{name}.")
+        else:
+            yield f"{name} {_shown(was)} for {_shown(wanted)}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return ",".join(_shown(one) for one in value)
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "yes", False: "no"}[value]
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def _bop_ids(scenes: list[Path]) -> list[tuple[int, int]]:
@@ -235,13 +350,17 @@ def _show_batch(scenes: list[Path], outcomes: dict[int, _Outcome], seconds: floa
     for column in ("found", "best score", "seconds", ""):
         table.add_column(column, justify="right", no_wrap=True)
     for i, scene in enumerate(scenes):
+        if i not in outcomes:
+            continue  # interrupted
         one = outcomes[i]
         note = "failed" if one.has_failed else "kept" if one.is_old else ""
         best = f"{max(one.scores):.2f}" if one.scores else ""
         cells = ("", "", "") if one.has_failed else (str(len(one.scores)), best, f"{one.seconds:.2f}")
-        table.add_row(str(scene), *cells, note)
-    out.print(table)
+        table.add_row(escape(str(scene)), *cells, note)
+    print_table(table)
     failed = sum(one.has_failed for one in outcomes.values())
     found = sum(len(one.scores) for one in outcomes.values())
-    line = f"{found} found in {len(scenes)} scans, {failed} of which failed; {seconds:.2f} s"
+    missing = len(scenes) - len(outcomes)
+    rest = f", {missing} not done" if missing else ""
+    line = f"{found} found in {len(outcomes)} scans, {failed} of which failed{rest}; {seconds:.2f} s"
     out.print(line, highlight=False)

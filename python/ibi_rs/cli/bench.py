@@ -18,7 +18,6 @@ import ibi_rs as ibi
 from ibi_rs import _batch, io
 
 from .common import (
-    ERRORS,
     FromAllSides,
     MaxInstances,
     ParamsFile,
@@ -28,23 +27,25 @@ from .common import (
     TimeoutS,
     Viewpoint,
     Voxel,
-    app,
     chosen_params,
+    command,
     err,
-    fail,
+    misused,
     out,
+    print_table,
+    try_outputs,
     write_json,
 )
 
 
-@app.command()
+@command()
 def bench(
     model: Annotated[
         Path | None,
         typer.Argument(help="Mesh of the part. Without one a synthetic scene is timed.", metavar="MODEL"),
     ] = None,
     scene: Annotated[Path | None, typer.Argument(help="Scan, in the same unit.", metavar="SCENE")] = None,
-    viewpoint: Viewpoint = (0.0, 0.0, 0.0),
+    viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
@@ -68,31 +69,29 @@ def bench(
     at the same time, they count the seconds of both.
     """
     if (model is None) != (scene is None):
-        fail("give MODEL and SCENE, or neither")
+        misused("give MODEL and SCENE, or neither")
     chosen = chosen_params(preset, params)
     search = Search(viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s)
+    try_outputs({"--output": output}, {"MODEL": model, "SCENE": scene, "--params": params})
     cores = _batch._cores()
     runs: dict[int, list[dict[str, float]]] = {}
     num_poses = 0
-    try:
-        with err.status("timing") as status:
-            for threads in sorted({1, cores}):
-                runs[threads] = []
-                for repeat in range(-1, repeats):
-                    status.update(f"threads {threads}: {max(repeat, 0)} of {repeats}")
-                    if model is not None and scene is not None:
-                        seconds, found = _time_files(search, model, scene, threads)
-                    else:
-                        seconds, found = _time_synthetic(search, threads)
-                    num_poses = len(found)
-                    if repeat >= 0:
-                        runs[threads].append(seconds)
-        data = _bench_data(model, scene, repeats, num_poses, runs)
-        _show_bench(data)
-        if output is not None:
-            write_json(output, data)
-    except ERRORS as error:
-        fail(error)
+    with err.status("timing") as status:
+        for threads in sorted({1, cores}):
+            runs[threads] = []
+            for repeat in range(-1, repeats):
+                status.update(f"threads {threads}: {max(repeat, 0)} of {repeats}")
+                if model is not None and scene is not None:
+                    seconds, found = _time_files(search, model, scene, threads)
+                else:
+                    seconds, found = _time_synthetic(search, threads)
+                num_poses = len(found)
+                if repeat >= 0:
+                    runs[threads].append(seconds)
+    data = _bench_data(model, scene, repeats, num_poses, runs)
+    _show_bench(data)
+    if output is not None:
+        write_json(output, data)
 
 
 class _Watch:
@@ -210,10 +209,10 @@ def _show_bench(data: dict[str, Any]) -> None:
             of = steps[step]
             cells += [f"{x:.4f}" for x in (statistics.median(of), min(of), max(of))]
         table.add_row(f"  {step}" if step in STAGES.values() else step, *cells)
-    out.print(table)
-    out.print(
-        f"{data['num_poses']} found; {data['repeats']} runs of {data['model']}, {data['scene']}",
-        highlight=False,
-    )
+    print_table(table)
+    runs = f"{data['num_poses']} found; {data['repeats']} runs of {data['model']}, {data['scene']}"
+    out.print(runs, highlight=False, markup=False)
     versions = f"ibi_rs {data['ibi_rs']}, Python {data['python']}, numpy {data['numpy']}"
-    out.print(f"{versions}; {data['cores']} cores, {data['cpu']}; {data['platform']}", highlight=False)
+    out.print(
+        f"{versions}; {data['cores']} cores, {data['cpu']}; {data['platform']}", highlight=False, markup=False
+    )

@@ -11,10 +11,11 @@ import typer
 
 import ibi_rs as ibi
 from ibi_rs import io
+from ibi_rs._files import read_npy
 
 from .common import (
-    ERRORS,
     FOUND_NOTHING,
+    MAX_THREADS,
     FromAllSides,
     MaxInstances,
     ModelFile,
@@ -27,28 +28,34 @@ from .common import (
     TimeoutS,
     Viewpoint,
     Voxel,
-    app,
     as_dict,
     chosen_params,
+    command,
     err,
-    fail,
+    misused,
     out,
+    sha256,
     show,
     symmetries_of,
+    try_outputs,
+    warn,
+    warnings_of,
     write_bop,
     write_json,
 )
 
 
-@app.command()
+@command()
 def register(
     model: ModelFile,
     scene: SceneFile,
     corr: Annotated[
         Path | None,
-        typer.Option(help="Your own correspondences, pairs of rows (NPY or text); MODEL is a cloud then."),
+        typer.Option(
+            help="Your own correspondences (NPY or text): pairs of rows, or of points; MODEL is a cloud then."
+        ),
     ] = None,
-    viewpoint: Viewpoint = (0.0, 0.0, 0.0),
+    viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
@@ -57,13 +64,15 @@ def register(
     params: ParamsFile = None,
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Default: all that the process may use.")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, max=MAX_THREADS, help="Default: all that the process may use.")
+    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON.")] = None,
     bop: Annotated[
         Path | None, typer.Option(help="Poses as BOP's CSV: t in mm, if the unit is the metre.")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="A picture (PNG): the scene grey, each part in a colour.")
+        Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
     ] = None,
     rerun: Annotated[
         Path | None,
@@ -76,64 +85,138 @@ def register(
 
     With your own matches:         ibi register part.npy scan.npy --corr m.npy
 
+    With your own matches the normals of both files count, where both have them.
+    If you give the --viewpoint then, too, it is a depth scan, and the preset
+    single_view fits; without it, default does.
+
     Exit code: 0 if parts were found, 3 if none was, 1 if the input is at fault,
-    2 if the command line is.
+    2 if the command line is, 130 after Ctrl-C.
     """
     start = time.perf_counter()
     if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
-        fail("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
+        misused("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
     chosen = chosen_params(preset, params)
     search = Search(
         viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries
     )
+    outputs = {"--output": output, "--bop": bop, "--plot": plot, "--rerun": rerun}
+    try_outputs(outputs, {"MODEL": model, "SCENE": scene, "--corr": corr, "--params": params})
     options = search.limits(threads)
     pairs: Any = None
-    try:
-        with err.status("reading") as status:
-            tgt, tgt_normals = io.read_cloud(scene)
-            if corr is not None:
-                src, src_normals = io.read_cloud(model)
-                held = symmetries_of(symmetries, src, src_normals)
-                pairs = _pairs(corr)
-                status.update("registering")
-                found = ibi.Model(src, symmetries=held).register(tgt, pairs, chosen, **options)
-            else:
-                part = search.model(model, threads)
-                src, held = part.points, part.symmetries
-                status.update("detecting")
-                found = part.detect(
-                    tgt,
-                    chosen,
-                    **search.sight(tgt_normals),
-                    callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
-                    **options,
-                )
-        seconds = time.perf_counter() - start
+    with err.status("reading") as status:
+        tgt, tgt_normals = io.read_cloud(scene)
+        if corr is not None:
+            pairs = _pairs(corr)
+            src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
+        else:
+            part = search.model(model, threads)
+            src, held = part.points, part.symmetries
+            status.update("detecting")
+            found = part.detect(
+                tgt,
+                chosen,
+                **search.sight(tgt_normals),
+                callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
+                **options,
+            )
+    seconds = time.perf_counter() - start
+    if not held.is_none:
         found = found.canonical(held)
-        show(found, seconds)
-        if not held.is_none:
-            out.print(f"modulo {held!r}", style="dim", highlight=False)
-        if output is not None:
-            write_json(output, as_dict(found, model, scene, seconds))
-        if bop is not None:
-            write_bop(bop, [(0, 0, np.asarray(found), [pose.score for pose in found], seconds)])
-        if plot is not None:
-            ibi.plot.instances(tgt, src, found, plot, title=f"{scene.name}: {len(found)} x {model.name}")
-        if rerun is not None:
-            if corr is None:  # once more, as `detect` keeps them to itself
-                matches = part.correspond(tgt, **search.sight(tgt_normals), num_threads=threads)
-                pairs = src[matches.corr[:, 0]], matches.tgt[matches.corr[:, 1]]
-            ibi.viz.record(tgt, src, found, rerun, corr=pairs)
-    except ERRORS as error:
-        fail(error)
+    for warning in warnings_of(found):
+        warn(warning)
+    show(found, seconds)
+    if not held.is_none:
+        out.print(f"modulo {held!r}", style="dim", highlight=False, markup=False)
+    if output is not None:
+        files: dict[str, Any] = {
+            "model": model,
+            "model_sha256": sha256(model),
+            "scene": scene,
+            "scene_sha256": sha256(scene),
+        }
+        recorded = search.recorded(held) | ({} if corr is None else {"corr": str(corr)})
+        write_json(output, as_dict(found, seconds, **files, search=recorded))
+    if bop is not None:
+        write_bop(bop, [(0, 0, np.asarray(found), [pose.score for pose in found], seconds)])
+    if plot is not None:
+        title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
+        title = title.encode(errors="replace").decode()  # names of files may be of any bytes
+        ibi.plot.instances(tgt, src, found, plot, title=title)
+    if rerun is not None:
+        if corr is None:  # once more, as `detect` keeps them to itself
+            matches = part.correspond(tgt, **search.sight(tgt_normals), num_threads=threads)
+            pairs = src[matches.corr[:, 0]], matches.tgt[matches.corr[:, 1]]
+        ibi.viz.record(tgt, src, found, rerun, corr=pairs)
     if len(found) == 0:
         raise typer.Exit(FOUND_NOTHING)
 
 
+def _with_matches(
+    search: Search, model: Path, tgt: Any, tgt_normals: Any, pairs: Any, options: dict[str, Any]
+) -> tuple[Any, ibi.Symmetries, ibi.Registration]:
+    """Register by given matches: the model's points, its symmetries, and what was found."""
+    src, src_normals = io.read_cloud(model)
+    held = symmetries_of(search.symmetries, src, src_normals)
+    if (src_normals is None) != (tgt_normals is None):
+        having, lacking = ("SCENE", "MODEL") if src_normals is None else ("MODEL", "SCENE")
+        warn(f"{having} has normals and {lacking} has none, so they have no say")
+    if src_normals is None or tgt_normals is None:
+        src_normals = tgt_normals = None
+        if search.viewpoint is not None:
+            warn("--viewpoint has no say where MODEL or SCENE has no normals")
+    # A scan's camera is at its origin unless it is said to be elsewhere; but is this a scan?
+    is_scan = search.viewpoint is not None or (search.params is not None and search.params.oriented_normals)
+    has_eye = tgt_normals is not None and is_scan
+    found = ibi.Model(src, normals=src_normals, symmetries=held).register(
+        tgt,
+        pairs,
+        search.params or (ibi.Params.single_view() if has_eye else ibi.Params()),
+        tgt_normals=tgt_normals,
+        viewpoint=(search.viewpoint or (0.0, 0.0, 0.0)) if has_eye else None,
+        **options,
+    )
+    return src, held, found
+
+
 def _pairs(path: Path) -> Any:
-    try:
-        return (
-            np.load(path, allow_pickle=False) if path.suffix == ".npy" else np.loadtxt(path, dtype=np.int64)
+    """(M, 2) rows or (M, 6) points, from NPY or from text."""
+    rows = read_npy(path) if path.suffix == ".npy" else _table(path)
+    if rows.ndim != 2 or rows.shape[1] not in (2, 6) or rows.dtype.kind not in "fiu":
+        raise ibi.InputError(
+            f"{path}: wanted (M, 2) rows or (M, 6) points, found {rows.dtype} of shape {rows.shape}"
         )
-    except (OSError, ValueError) as error:
-        raise ibi.InputError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from error
+    if rows.shape[1] == 6 or rows.dtype.kind != "f":
+        return rows
+    whole = np.isfinite(rows) & (rows == np.trunc(rows)) & (np.abs(rows) < 2**53)
+    if not whole.all():
+        row = int(np.flatnonzero(~whole.all(axis=1))[0])
+        raise ibi.InputError(f"{path}: pair {row} is {rows[row].tolist()}; rows are whole numbers, from 0")
+    return rows.astype(np.int64)  # np.savetxt writes them as floats
+
+
+def _table(path: Path) -> Any:
+    """Numbers in columns, apart by blanks, commas or semicolons, perhaps below a header."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ibi.InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise ibi.InputError(f"{path}: cannot be read: it is neither NPY nor text") from None
+    rows: list[list[float]] = []
+    is_first = True
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
+        if not words:
+            continue
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError:
+            if not is_first:
+                raise ibi.InputError(f"{path}, line {number}: wanted numbers, found {line[:40]!r}") from None
+        is_first = False
+        if rows and len(rows[-1]) != len(rows[0]):
+            wanted = f"{len(rows[0])} numbers as in the first"
+            raise ibi.InputError(f"{path}, line {number}: wanted {wanted}, found {len(rows[-1])}")
+    if not rows:
+        raise ibi.InputError(f"{path}: has no pairs")
+    return np.array(rows)
