@@ -64,6 +64,29 @@ def test_detection_takes_the_camera_either_way():
     assert len(plain) == 2
 
 
+def moved_by(motion):
+    return ibi.View.from_depth(np.ones((2, 2)), 1, 1, 0, 0, target_from_camera=motion)
+
+
+SHIFTED = np.eye(4)
+SHIFTED[:3, 3] = [1, 2, 3]
+MOTIONS = [
+    (SHIFTED.T, "no rigid motion"),
+    (2 * np.eye(4), "no rigid motion"),
+    (np.diag([2.0, 2, 2, 1]), "no rigid motion"),
+    (np.diag([-1.0, 1, 1, 1]), "no rigid motion"),
+    (np.zeros((4, 4)), "no rigid motion"),
+    (np.full((4, 4), 1e300), "no rigid motion"),
+    (np.full((4, 4), np.nan), "a value that is not finite"),
+]
+CAMERAS = [
+    ((np.nan, 1, 0, 0), "fx and fy are nan and 1"),
+    ((np.inf, 1, 0, 0), "fx is inf; it must be finite"),
+    ((1, 1, np.nan, 0), "cx is nan"),
+    ((1, 1, 0, np.inf), "cy is inf"),
+]
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -76,6 +99,15 @@ def test_detection_takes_the_camera_either_way():
             lambda: ibi.View.from_depth(np.ones((2, 2)), 1, 1, 0, 0, target_from_camera=np.eye(3)),
             r"target_from_camera has shape \(3, 3\)",
         ),
+        (
+            lambda: ibi.View([np.nan, 0, 0], np.zeros((3, 3))),
+            r"viewpoint is \[nan, 0.0, 0.0\]; it must be finite",
+        ),
+        *((lambda motion=motion: moved_by(motion), message) for motion, message in MOTIONS),
+        *(
+            (lambda camera=camera: ibi.View.from_depth(np.ones((2, 2)), *camera), message)
+            for camera, message in CAMERAS
+        ),
     ],
 )
 def test_bad_views_are_refused_by_name(call, message):
@@ -85,3 +117,8 @@ def test_bad_views_are_refused_by_name(call, message):
 
 def test_points_that_are_not_finite_were_not_measured():
     assert len(ibi.View(CAMERA, [[0, 0, 1], [np.nan, 0, 1], [0, np.inf, 1]]).points) == 1
+
+
+def test_organised_points_are_taken():
+    image = np.arange(24.0).reshape(2, 4, 3)
+    np.testing.assert_array_equal(ibi.View(CAMERA, image).points, image.reshape(-1, 3))

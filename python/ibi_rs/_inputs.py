@@ -86,6 +86,46 @@ def _scan(
     return held, of_points, num_dropped
 
 
+RIGID_TOLERANCE = 1e-6
+"""How far from a rotation a matrix may be, per entry of R^T R: single precision passes, a scale does not."""
+
+
+def _rigid(name: str, value: Any) -> npt.NDArray[np.float64]:
+    """(4, 4), a rotation and a translation."""
+    motion = np.asarray(_real(name, value), dtype=np.float64)
+    if motion.shape != (4, 4):
+        raise InputError(f"{name} has shape {motion.shape}; it must be (4, 4)")
+    if not np.isfinite(motion).all():
+        raise InputError(f"{name} has a value that is not finite")
+    turn = motion[:3, :3]
+    with np.errstate(over="ignore"):
+        off = np.abs(turn.T @ turn - np.eye(3)).max()
+    if not off <= RIGID_TOLERANCE or np.linalg.det(turn) < 0 or motion[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"{name} is no rigid motion: its upper 3x3 must be a rotation, its last row 0 0 0 1;"
+            " is it transposed?"
+        )
+    return motion
+
+
+def _mesh(vertices: Any, faces: Any) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """(V, 3) and (F, 3), from arrays or from an object that holds both."""
+    if faces is None:
+        if hasattr(vertices, "geometry") and hasattr(vertices, "dump"):  # a Scene of trimesh
+            parts = vertices.dump()
+            counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+            faces = [np.asarray(part.faces) + start for part, start in zip(parts, counts, strict=False)]
+            faces = np.concatenate(faces) if faces else None
+            vertices = np.concatenate([part.vertices for part in parts]) if parts else np.empty((0, 3))
+        else:
+            faces = getattr(vertices, "faces", getattr(vertices, "triangles", None))
+            triangle = getattr(vertices, "triangle", None)  # Open3D's tensor meshes
+            faces = getattr(triangle, "indices", faces)
+        if faces is None or len(faces) == 0:
+            raise InputError("faces: the mesh has none; a cloud goes to Model(src, normals=...)")
+    return _points("vertices", vertices), _faces(faces)
+
+
 def _frames(name: str, value: Any) -> npt.NDArray[np.float64]:
     array = _real(name, value)
     if array.ndim != 3 or array.shape[1:] != (3, 3):

@@ -16,9 +16,9 @@ from ibi_rs._detect import Matches
 from ibi_rs._inputs import (
     Points,
     _correspondences,
-    _faces,
     _frames,
     _frozen,
+    _mesh,
     _num_threads,
     _number,
     _points,
@@ -223,8 +223,7 @@ class Model:
         Parameters
         ----------
         vertices : (V, 3) array_like
-            In the unit of the scenes; or an object with ``.vertices`` and ``.faces`` (trimesh), or with
-            ``.vertices`` and ``.triangles`` (Open3D).
+            In the unit of the scenes; or a mesh or Scene of trimesh, or a mesh of Open3D.
         faces : (F, 3) array_like of int
             Rows of ``vertices``; left out where the object has them. Where they are seen from their backs
             only, their normals are turned: it does not matter how the faces of a closed mesh are wound.
@@ -261,17 +260,13 @@ class Model:
         >>> round(model.diameter, 1)
         3.7
         """
-        if faces is None:
-            faces = getattr(vertices, "faces", getattr(vertices, "triangles", None))
-            if faces is None or len(faces) == 0:
-                raise _core.InputError("faces: the mesh has none; a cloud goes to Model(src, normals=...)")
+        mesh = _mesh(vertices, faces)
         if voxel is not None:
             voxel = _number("voxel", voxel)
             if not 0 < voxel < math.inf:
                 raise _core.InputError(f"voxel is {voxel:g}; it must be above 0 and finite")
         if isinstance(symmetries, str) and symmetries != "find":
             raise _core.InputError(f"symmetries is {symmetries!r}; it must be 'find' or Symmetries")
-        mesh = _points("vertices", vertices), _faces(faces)
         has_hand_voxel = voxel is not None
         points, normals, voxel = _detect.mesh_points(*mesh, voxel, num_threads)
         if isinstance(symmetries, str):

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._inputs import _frozen, _number, _points, _real, _viewpoint
+from ibi_rs._inputs import _frozen, _number, _real, _rigid, _scan_points, _viewpoint
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,9 +38,12 @@ class View:
     points: npt.NDArray[np.float64]
 
     def __init__(self, eye: npt.ArrayLike, points: Any) -> None:
-        held = _points("viewpoint.points", points)
-        object.__setattr__(self, "eye", _frozen(np.array(_viewpoint(eye))))
-        object.__setattr__(self, "points", _frozen(held[np.isfinite(held).all(axis=1)]))
+        place = np.array(_viewpoint(eye))
+        if not np.isfinite(place).all():
+            raise _core.InputError(f"viewpoint is {place.tolist()}; it must be finite")
+        held, _ = _scan_points("viewpoint.points", points)
+        object.__setattr__(self, "eye", _frozen(place))
+        object.__setattr__(self, "points", _frozen(held.copy()))
 
     @classmethod
     def from_depth(
@@ -73,30 +76,37 @@ class View:
         Raises
         ------
         InputError
-            An array has a wrong shape, a focal length is not above 0, or no pixel has a depth.
+            An array has a wrong shape, a focal length is not above 0, a number is not finite, the matrix is
+            no rigid motion, or no pixel has a depth.
         TypeError
             An argument is of another type than above.
         """
         image = np.asarray(_real("depth", depth), dtype=np.float64)
         if image.ndim != 2:
             raise _core.InputError(f"depth has shape {image.shape}; it must be (H, W)")
-        names = ("fx", "fy", "cx", "cy")
-        fx, fy, cx, cy = (_number(name, value) for name, value in zip(names, (fx, fy, cx, cy), strict=True))
-        if not (fx > 0 and fy > 0):
-            raise _core.InputError(f"fx and fy are {fx:g} and {fy:g}; they must be above 0")
-        points = depth_points(image, fx, fy, cx, cy)
+        points = depth_points(image, *_intrinsics(fx, fy, cx, cy))
         if len(points) == 0:
             raise _core.InputError("depth: no pixel has one")
         if target_from_camera is None:
             return cls(np.zeros(3), points)
-        motion = np.asarray(_real("target_from_camera", target_from_camera), dtype=np.float64)
-        if motion.shape != (4, 4):
-            raise _core.InputError(f"target_from_camera has shape {motion.shape}; it must be (4, 4)")
+        motion = _rigid("target_from_camera", target_from_camera)
         return cls(motion[:3, 3], points @ motion[:3, :3].T + motion[:3, 3])
 
     def __repr__(self) -> str:
         eye = ", ".join(np.format_float_positional(x + 0.0, 9, trim="-") for x in self.eye.round(9))
         return f"View({len(self.points)} points from [{eye}])"
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> tuple[float, float, float, float]:
+    """Check a pinhole camera."""
+    names = ("fx", "fy", "cx", "cy")
+    values = [_number(name, value) for name, value in zip(names, (fx, fy, cx, cy), strict=True)]
+    if not (values[0] > 0 and values[1] > 0):
+        raise _core.InputError(f"fx and fy are {values[0]:g} and {values[1]:g}; they must be above 0")
+    for name, value in zip(names, values, strict=True):
+        if not np.isfinite(value):
+            raise _core.InputError(f"{name} is {value:g}; it must be finite")
+    return values[0], values[1], values[2], values[3]
 
 
 def depth_points(
@@ -105,7 +115,9 @@ def depth_points(
     """Return a point for each pixel with a finite depth above 0, row by row, in the frame of the camera."""
     v, u = np.nonzero(np.isfinite(image) & (image > 0))
     z = image[v, u]
-    return np.column_stack([(u - cx) / fx * z, (v - cy) / fy * z, z])
+    with np.errstate(over="ignore", invalid="ignore"):  # what leaves the numbers is no point
+        points = np.column_stack([(u - cx) / fx * z, (v - cy) / fy * z, z])
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _camera(

@@ -1,0 +1,226 @@
+"""Meshes, scans and depth images from files, through well-kept readers: ``pip install 'ibi_rs[io]'``.
+
+Every error names the file. Lengths are those of the file; nothing is scaled but depth images. A file that
+holds fewer rows than it says is refused, not read by half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ibi_rs import _core
+from ibi_rs._core import InputError
+from ibi_rs._inputs import _number
+from ibi_rs._view import _intrinsics, depth_points
+
+from . import _arrays, _clouds, _meshes, _text
+from ._files import Floats, PathLike, Rows, extra, reading
+
+__all__ = ["Scan", "read_cloud", "read_depth", "read_mesh", "read_scan"]
+
+_READERS: dict[str, Callable[[Path], Rows]] = {
+    **dict.fromkeys(_meshes.SUFFIXES, _meshes.vertices),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".pts"), _text.read),
+    **dict.fromkeys((".las", ".laz"), _clouds.las),
+    ".pcd": _clouds.pcd,
+    ".npy": _arrays.npy,
+    ".npz": _arrays.npz,
+}
+
+_MOST_WITHOUT_NORMAL = 0.5
+"""A file in which more of the points have none gives none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan as a file holds it: what :meth:`Model.detect` wants.
+
+    Attributes
+    ----------
+    points : (N, 3) float64
+        Without those that are not finite, as depth cameras write them where they see nothing.
+    normals : (N, 3) float64 or None
+        Of any length but 0. A point that has none in a file in which most have one gets that of its nearest
+        point.
+    viewpoint : (3,) float64 or None
+        Where the camera stood in the frame of the points, if the file says so (PCD's ``VIEWPOINT``).
+    num_dropped : int
+        How many points were not finite.
+    """
+
+    points: Floats
+    normals: Floats | None
+    viewpoint: Floats | None
+    num_dropped: int
+
+
+def read_mesh(path: PathLike) -> tuple[Floats, npt.NDArray[np.int64]]:
+    """Read the triangles of an STL, PLY, OBJ, OFF or GLB file.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    vertices : (V, 3) float64
+        Vertices at one place are one.
+    faces : (F, 3) int64
+        Polygons of more corners are cut into triangles, concave ones along their outline.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, has another suffix, holds less than it says, or has no faces (then it may be
+        a cloud).
+    ImportError
+        A reader is not installed; the message names the extra.
+    """
+    path = Path(path)
+    _meshes.check_suffix(path)
+    return reading(path, lambda: _meshes.mesh(path))
+
+
+def read_cloud(path: PathLike) -> tuple[Floats, Floats | None]:
+    """Read a point cloud whose rows may be numbered by others; else as :func:`read_scan`.
+
+    Of a mesh the vertices are taken, in the order of the file.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    points : (N, 3) float64
+    normals : (N, 3) float64 or None
+
+    Raises
+    ------
+    InputError, ImportError
+        As :func:`read_scan`.
+    """
+    scan = _scan(Path(path), _READERS)
+    return scan.points, scan.normals
+
+
+def read_scan(path: PathLike) -> Scan:
+    """Read a scan: PLY, OBJ, STL, OFF, GLB, PCD, LAS, LAZ, XYZ, TXT, PTS, CSV, NPY or NPZ.
+
+    Where a file has faces of very different sizes, as CAD programs make them, points are drawn on these; the
+    vertices of a mesh that is as dense everywhere, as scanners make it, are taken as they are.
+
+    Parameters
+    ----------
+    path : path
+        A text file has a point a line, its columns apart by spaces, tabs, ``,`` or ``;``. Where a line names
+        the columns, ``x, y, z`` and ``nx, ny, nz`` (or ``normal_x`` ...) are taken, in any order. Where none
+        does, the first three are, and the next three are normals if they are of length 1; intensities and
+        colours are left out. An NPY file holds (N, 3) or (N, 6) numbers, likewise; an NPZ file ``points`` (or
+        ``tgt``) and perhaps ``normals``. No file may hold more than 2^27 points.
+
+    Returns
+    -------
+    Scan
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, has another suffix, holds less than it says, or has no points; or its columns
+        could mean several things.
+    ImportError
+        A reader is not installed; the message names the extra.
+    """
+    return _scan(Path(path), _READERS | dict.fromkeys(_meshes.SUFFIXES, _meshes.surface))
+
+
+def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:
+    suffix = path.suffix.lower()
+    if suffix not in readers:
+        raise InputError(f"{path}: clouds are read from {', '.join(sorted(readers))}, not from '{suffix}'")
+    rows = reading(path, lambda: readers[suffix](path))
+    points = np.asarray(rows.points, dtype=np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    normals = rows.normals
+    if normals is not None:
+        normals = np.ascontiguousarray(normals[finite], dtype=np.float64)
+    points = np.ascontiguousarray(points[finite])
+    if len(points) == 0:
+        raise InputError(f"{path}: no points")
+    if normals is not None:
+        normals = _completed(points, normals)
+    return Scan(points, normals, rows.viewpoint, int((~finite).sum()))
+
+
+def _completed(points: Floats, normals: Floats) -> Floats | None:
+    """Writers give 0 or NaN where they know no normal."""
+    is_missing = ~(np.isfinite(normals).all(axis=1) & (np.abs(normals).max(axis=1) > 0))
+    if not is_missing.any():
+        return normals
+    if is_missing.mean() > _MOST_WITHOUT_NORMAL:
+        return None
+    # A match of positions is a search for the nearest.
+    have = np.nonzero(~is_missing)[0]
+    centred = (points - points.mean(axis=0)).astype(np.float32)
+    pairs, _ = _core.features_match(centred[have], centred[is_missing], 1, False, None, None)
+    normals[np.nonzero(is_missing)[0][pairs[:, 1]]] = normals[have[pairs[:, 0]]]
+    return normals
+
+
+def read_depth(
+    path: PathLike, fx: float, fy: float, cx: float, cy: float, *, scale: float = 0.001, offset: float = 0.0
+) -> Floats:
+    """Read a depth image as a cloud in the frame of its camera: x to the right, y down, z forward.
+
+    Parameters
+    ----------
+    path : path
+        PNG or TIFF with one channel. Pixels of 0, those that are not finite and, of 16 bits, those of the
+        largest value have no depth.
+    fx, fy, cx, cy : float
+        Focal lengths (above 0) and principal point of the pinhole camera, pixels.
+    scale, offset : float
+        A pixel's depth along z is ``offset + scale * value``; by default millimetres become metres. The scale
+        is above 0.
+
+    Returns
+    -------
+    (N, 3) float64
+        A point for each pixel with a depth, row by row.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or has more than one channel, or no depth at all; or a number is out of
+        range.
+    ImportError
+        Pillow is not installed; the message names the extra.
+    """
+    path = Path(path)
+    camera = _intrinsics(fx, fy, cx, cy)
+    scale, offset = _number("scale", scale), _number("offset", offset)
+    if not 0 < scale < np.inf or not np.isfinite(offset):
+        raise InputError(f"scale and offset are {scale:g} and {offset:g}; scale must be above 0, both finite")
+
+    def read() -> tuple[npt.NDArray[Any], bool]:
+        with extra("PIL.Image").open(path) as image:
+            # Some versions of Pillow hold the 16 bits of a PNG in 32.
+            return np.asarray(image), image.format == "PNG" or image.mode.startswith("I;16")
+
+    depth, has_16_bits = reading(path, read)
+    if depth.ndim != 2:
+        raise InputError(f"{path}: a depth image has one channel, this has shape {depth.shape}")
+    is_measured = np.isfinite(depth) & (depth > 0)
+    if has_16_bits:
+        is_measured &= depth < np.iinfo(np.uint16).max
+    z = np.where(is_measured, offset + scale * np.where(is_measured, depth, 0).astype(np.float64), 0)
+    points = depth_points(z, *camera)
+    if len(points) == 0:
+        raise InputError(f"{path}: no pixel has a depth")
+    return points
