@@ -158,7 +158,8 @@ def _correspondences(value: Any) -> npt.NDArray[Any]:
         return np.hstack([source, target])
     if not isinstance(value, np.ndarray):
         value = getattr(value, "correspondence_set", value)  # Open3D's RegistrationResult
-    if isinstance(value, (tuple, list, np.ndarray)) and np.ndim(value) and len(value) == 0:  # of any dtype
+    is_sized = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+    if is_sized and len(value) == 0:  # of any dtype
         return np.empty((0, 2), np.int64)
     array = _real("corr", value)
     if array.shape == (0,):
@@ -189,7 +190,7 @@ def _num_threads(value: int | None) -> int | None:
         given = int(given) if given.isdecimal() and len(given) < 10 else given
     is_integer = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
     if not is_integer or not 1 <= given <= _MAX_THREADS:
-        raise InputError(f"{name} is {given!r}; it must be an integer from 1 to {_MAX_THREADS}")
+        raise ValueError(f"{name} is {given!r}; it must be an integer from 1 to {_MAX_THREADS}")
     return int(given)
 
 

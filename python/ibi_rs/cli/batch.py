@@ -213,10 +213,10 @@ def _run_all(
         bar = progress.add_task("detecting", total=len(todo))
 
         def ended(number: int, found: ibi.Registration | ibi.JobError) -> None:
+            keep(number, found)  # before it is told, so that what was told is in the table
             if isinstance(found, ibi.JobError):
                 name = "" if str(found.name) in found.reason else f"{found.name}: "
-                say(f"{name}{found.reason}")  # above the bar, which is on this console
-            keep(number, found)
+                say(f"{name}{found.reason}")
             progress.advance(bar)
 
         for _ in ibi.register_batch(todo, jobs, num_threads=threads, callback=ended):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import hashlib
 import json
 import os
@@ -120,8 +121,9 @@ def _in_one_line() -> Iterator[None]:
     except RecursionError:
         fail("the input is nested too deeply")
     except ERRORS as error:
-        if isinstance(error, OSError) and error.filename is None:  # of what is printed: the disk is full
-            _discard(sys.stdout)
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            _discard(sys.stdout)  # else Python would try again, and fail again, at its end
+            fail(f"cannot print: {error.strerror}")
         fail(error)
 
 
