@@ -74,6 +74,14 @@ def test_an_empty_table_is_empty(table, part, num_stray, spread):
     assert found.labels.dtype == np.int32
 
 
+def test_a_flat_part_is_no_table():
+    plate = ibi.Model.from_mesh(*box(np.array([1.0, 0.6, 0.02])))
+    seen = plate.points[plate.normals[:, 2] > 0.9] * [1, -1, -1] + [0, 0, 6]
+    matches = plate.correspond(seen, viewpoint=EYE)
+    assert len(matches.tgt) > 0.9 * len(seen)
+    assert matches.warnings == ()
+
+
 @pytest.mark.parametrize(
     ("scan", "warning"),
     [

@@ -45,8 +45,8 @@ STRAY_SPACINGS = 4
 """Points beside a table are stray ones if they are so much farther apart than those of the whole scan."""
 TWIN_SPACINGS, MAX_TWINS = 0.1, 0.1
 """Model points so near are twins, in spacings; with a larger share of them it is thinned to be described."""
-TABLE_DIAMETERS = 3.0
-"""A plane that hangs together over more is no face of a part."""
+TABLE_DIAMETERS = 2.0
+"""A plane that hangs together over more is no face of a part, nor of two that touch."""
 TABLE_SHARE, BEHIND_SHARE, FRONT_PER_BEHIND = 0.3, 0.05, 0.1
 """Shares of a scan: on a table, and behind it; and before it to behind it, where it is seen from below."""
 

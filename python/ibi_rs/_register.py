@@ -417,8 +417,7 @@ class Model:
         return matches, points
 
     def _match_scan(self, scan: _detect.Scan, num_threads: int | None) -> Matches:
-        size = float(np.linalg.norm(np.ptp(scan.points, axis=0))) if len(scan.points) >= 3 else 0.0
-        if size <= self.spacing or not self._is_known_at(scan.voxel):
+        if self._is_nothing(scan) or not self._is_known_at(scan.voxel):
             return Matches(scan.points, scan.normals, np.empty((0, 2), np.int64), np.empty(0))
         assert self._normals is not None  # `correspond` has looked
         if scan.voxel not in self._described:
@@ -431,6 +430,11 @@ class Model:
         if rows is not None:
             corr[:, 0] = rows[corr[:, 0]]
         return Matches(scan.points, scan.normals, corr, similarity)
+
+    def _is_nothing(self, scan: _detect.Scan) -> bool:
+        """Whether too little is left of a scan for a pose."""
+        points = scan.points
+        return len(points) < 3 or bool(np.linalg.norm(np.ptp(points, axis=0)) <= self.spacing)
 
     def _is_known_at(self, voxel: float) -> bool:
         """Whether enough is left of this model in such voxels, unless they are its own."""
@@ -449,7 +453,7 @@ class Model:
             yield f"{num_dropped} of {given} points of the scan are not finite, and were left out"
         if num_points < 3:
             yield f"the scan has {num_points} points"
-        elif len(scan.points) < 3:
+        elif self._is_nothing(scan):
             yield "the scan is a table, or stray points, and nothing else"
         elif not self._is_known_at(scan.voxel):
             yield (
