@@ -13,7 +13,7 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 import trimesh
-from ibi_rs import cli
+from ibi_rs import cli, io
 from scipy.spatial.transform import Rotation
 from test_process import LIMIT_S
 from test_viz import NO_RERUN
@@ -329,7 +329,7 @@ def test_what_a_user_can_do_something_about_is_one_line(error, code, line, monke
     def broken(path):
         raise error
 
-    monkeypatch.setattr(ibi.io, "read_cloud", broken)
+    monkeypatch.setattr(ibi.io, "read_scan", broken)
     result = run("register", MESH, SCAN)
     assert result.exit_code == code
     assert result.stderr == ("" if line is None else f"ibi: {line}\n")
@@ -838,3 +838,25 @@ def test_rotation_vectors_are_scipys():
     for rotation in [*rotations, *half, Rotation.identity()]:
         ours = Rotation.from_rotvec(cli.common._rotation_vector(rotation.as_matrix()))
         assert (ours * rotation.inv()).magnitude() < 1e-7
+
+
+def test_the_viewpoint_of_a_file_counts_unless_one_is_given(found, tmp_path):
+    """A scan in the frame of a robot that stands behind it."""
+    pypcd4 = pytest.importorskip("pypcd4")
+    points, _ = io.read_cloud(SCAN)
+    shift = np.array([0.0, 0.0, -2 * points[:, 2].max()])
+    cloud = pypcd4.PointCloud.from_xyz_points((points + shift).astype(np.float32))
+    cloud.metadata.viewpoint = (*shift, 1, 0, 0, 0)
+    cloud.save(tmp_path / "moved.pcd")
+    here = json.loads(found[1][0].read_text())["poses"]
+    there = tmp_path / "there.json"
+    assert run("register", MESH, tmp_path / "moved.pcd", "-o", there).exit_code == 0
+    moved = [np.array(pose["target_from_source"])[:3, 3] for pose in json.loads(there.read_text())["poses"]]
+    assert len(moved) == len(here)
+    for pose in here:
+        apart = np.linalg.norm(moved - np.array(pose["target_from_source"])[:3, 3] - shift, axis=1)
+        assert apart.min() < 2
+    result = run("register", MESH, tmp_path / "moved.pcd", "--viewpoint", "0,0,0", "-o", there)
+    assert len(json.loads(there.read_text())["poses"]) < len(here) or result.exit_code == 3
+    result = run("batch", MESH, tmp_path / "moved.pcd", "-o", tmp_path / "batch")
+    assert len(json.loads((tmp_path / "batch/moved.json").read_text())["poses"]) == len(here)

@@ -54,7 +54,7 @@ class Job:
     model : Model
         To be found.
     tgt : (N, 3) array_like, or path
-        The scene, as in :func:`register`; or a file, which :func:`ibi_rs.io.read_cloud` reads where the job
+        The scene, as in :func:`register`; or a file, which :func:`ibi_rs.io.read_scan` reads where the job
         runs. The normals in it count where ``corr``, ``tgt_normals`` and ``viewpoint`` are left out.
     corr : optional
         Correspondences, as in :func:`register`.
@@ -133,13 +133,17 @@ class Job:
         Raises
         ------
         InputError, ParamsError, TypeError, ValueError
-            Those of :func:`register`, :meth:`Model.detect` and :func:`ibi_rs.io.read_cloud`.
+            Those of :func:`register`, :meth:`Model.detect` and :func:`ibi_rs.io.read_scan`.
         """
         tgt, tgt_normals = self.tgt, self.tgt_normals
         if self.path is not None:
-            tgt, normals = io.read_cloud(self.path)
-            if self.corr is None and tgt_normals is None and self.viewpoint is None:
-                tgt_normals = normals
+            if self.corr is None:
+                scan = io.read_scan(self.path)
+                tgt, normals = scan.points, scan.normals
+                if tgt_normals is None and self.viewpoint is None:
+                    tgt_normals = normals
+            else:
+                tgt, _ = io.read_cloud(self.path)
         options: dict[str, Any] = {
             "tgt_normals": tgt_normals,
             "viewpoint": self.viewpoint,

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 import ibi_rs as ibi
+from ibi_rs import io
 from ibi_rs._files import read_json, try_writing
 
 from .common import (
@@ -129,8 +130,8 @@ def batch(
             outcomes[i] = old
     new = [i for i in range(len(scenes)) if i not in outcomes]
     # Without a viewpoint a job takes the normals of its file.
-    options = search.sight(None) | search.limits(None)
-    todo = [_TimedJob(part, scenes[i], params=chosen, **options) for i in new]
+    options = [search.sight(None, _place(scenes[i])) | search.limits(None) for i in new]
+    todo = [_TimedJob(part, scenes[i], params=chosen, **own) for i, own in zip(new, options, strict=True)]
 
     def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
         i, job = new[number], todo[number]
@@ -161,6 +162,14 @@ def batch(
         write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id)
     if any(one.has_failed for one in outcomes.values()):
         raise typer.Exit(1)
+
+
+def _place(scene: Path) -> Any:
+    """Return where the camera of a scan stood, if its file says so; its job tells if it cannot be read."""
+    try:
+        return io.read_viewpoint(scene)
+    except ibi.InputError:
+        return None
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -126,12 +126,12 @@ def _time_files(
 ) -> tuple[dict[str, float], ibi.Registration]:
     watch = _Watch()
     mesh = io.read_mesh(model)
-    tgt, tgt_normals = io.read_cloud(scene)
+    scan = io.read_scan(scene)
     watch.lap("read")
     part = ibi.Model.from_mesh(*mesh, voxel=search.voxel, num_threads=threads)
     watch.lap("model")
-    sight = search.sight(tgt_normals)
-    matches = part.correspond(tgt, **sight, num_threads=threads)
+    sight = search.sight(scan.normals, scan.viewpoint)
+    matches = part.correspond(scan.points, **sight, num_threads=threads)
     watch.lap("match")
     default = ibi.Params() if search.from_all_sides else ibi.Params.single_view()
     found = part.register(

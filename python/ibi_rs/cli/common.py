@@ -218,7 +218,8 @@ SceneFile = Annotated[
 Viewpoint = Annotated[
     tuple[float, float, float] | None,
     typer.Option(
-        help="Where the depth camera stood, in the frame of SCENE: X,Y,Z or three numbers. Default: 0,0,0.",
+        help="Where the depth camera stood, in the frame of SCENE: X,Y,Z or three numbers. "
+        "Default: what a PCD file says, else 0,0,0.",
         metavar="X Y Z",
     ),
 ]
@@ -280,11 +281,12 @@ class Search:
             *mesh, voxel=self.voxel, symmetries=wanted or "find", num_threads=num_threads
         )
 
-    def sight(self, normals: Any) -> dict[str, Any]:
-        """Those arguments of `Model.correspond` that `Model.detect` has, too."""
+    def sight(self, normals: Any, viewpoint: Any) -> dict[str, Any]:
+        """Those arguments of `Model.correspond` that `Model.detect` has, too, by what a file says."""
+        place = (0.0, 0.0, 0.0) if viewpoint is None else tuple(viewpoint)
         return {
             "tgt_normals": normals if self.from_all_sides else None,
-            "viewpoint": None if self.from_all_sides else self.viewpoint or (0.0, 0.0, 0.0),
+            "viewpoint": None if self.from_all_sides else self.viewpoint or place,
             "remove_plane": self.remove_plane,
         }
 

@@ -104,18 +104,20 @@ def register(
     options = search.limits(threads)
     pairs: Any = None
     with err.status("reading") as status:
-        tgt, tgt_normals = io.read_cloud(scene)
         if corr is not None:
+            tgt, tgt_normals = io.read_cloud(scene)
             pairs = _pairs(corr)
             src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
         else:
+            scan = io.read_scan(scene)
+            tgt, sight = scan.points, search.sight(scan.normals, scan.viewpoint)
             part = search.model(model, threads)
             src, held = part.points, part.symmetries
             status.update("detecting")
             found = part.detect(
                 tgt,
                 chosen,
-                **search.sight(tgt_normals),
+                **sight,
                 callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
                 **options,
             )
@@ -144,7 +146,7 @@ def register(
         ibi.plot.instances(tgt, src, found, plot, title=title)
     if rerun is not None:
         if corr is None:  # once more, as `detect` keeps them to itself
-            matches = part.correspond(tgt, **search.sight(tgt_normals), num_threads=threads)
+            matches = part.correspond(tgt, **sight, num_threads=threads)
             pairs = src[matches.corr[:, 0]], matches.tgt[matches.corr[:, 1]]
         ibi.viz.record(tgt, src, found, rerun, corr=pairs)
     if len(found) == 0:

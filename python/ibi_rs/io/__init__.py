@@ -22,7 +22,7 @@ from ibi_rs._view import _intrinsics, depth_points
 from . import _arrays, _clouds, _meshes, _text
 from ._files import Floats, PathLike, Rows, extra, reading
 
-__all__ = ["Scan", "read_cloud", "read_depth", "read_mesh", "read_scan"]
+__all__ = ["Scan", "read_cloud", "read_depth", "read_mesh", "read_scan", "read_viewpoint"]
 
 _READERS: dict[str, Callable[[Path], Rows]] = {
     **dict.fromkeys(_meshes.SUFFIXES, _meshes.vertices),
@@ -138,6 +138,27 @@ def read_scan(path: PathLike) -> Scan:
         A reader is not installed; the message names the extra.
     """
     return _scan(Path(path), _READERS | dict.fromkeys(_meshes.SUFFIXES, _meshes.surface))
+
+
+def read_viewpoint(path: PathLike) -> Floats | None:
+    """Read where the camera of a scan stood, without the scan.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    (3,) float64 or None
+        As in :class:`Scan`.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    path = Path(path)
+    return reading(path, lambda: _clouds.viewpoint(path)) if path.suffix.lower() == ".pcd" else None
 
 
 def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
 from ibi_rs._core import InputError
 
-from ._files import Rows, check_count, check_most, extra
+from ._files import Floats, Rows, check_count, check_most, extra
 
 LZF_RATIO = 264
 """No three bytes of LZF hold more."""
@@ -26,25 +25,31 @@ def pcd(path: Path) -> Rows:
     check_count(said, len(np.atleast_1d(cloud.pc_data)), "points")
     names = ("normal_x", "normal_y", "normal_z")
     normals = cloud.numpy(names) if all(name in cloud.fields for name in names) else None
-    place = cloud.metadata.viewpoint
-    viewpoint = np.array([float(x) for x in tuple(place)[:3]]) if isinstance(place, tuple) else _place(place)
-    return Rows(cloud.numpy(("x", "y", "z")), normals, viewpoint)
+    return Rows(cloud.numpy(("x", "y", "z")), normals, viewpoint(path))
 
 
-def _place(viewpoint: Any) -> npt.NDArray[np.float64]:
-    return np.array([viewpoint.tx, viewpoint.ty, viewpoint.tz], dtype=np.float64)
+def viewpoint(path: Path) -> Floats | None:
+    """Where the camera stood, if the header says so."""
+    with path.open("rb") as file:
+        place = np.array(_pcd_header(file).get("VIEWPOINT", [])[:3], dtype=np.float64)
+    return place if place.shape == (3,) and np.isfinite(place).all() else None
+
+
+def _pcd_header(file: BinaryIO) -> dict[str, list[str]]:
+    header: dict[str, list[str]] = {}
+    for line in file:
+        words = line.decode("utf-8").split()
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+        if "DATA" in header:
+            break
+    return header
 
 
 def _check_pcd(path: Path) -> int:
-    """How many points the header says; refuses more than the file can hold."""
-    header: dict[str, list[str]] = {}
+    """Return how many points the header says; refuse more than the file can hold."""
     with path.open("rb") as file:
-        for line in file:
-            words = line.decode("utf-8").split()
-            if words and not words[0].startswith("#"):
-                header[words[0]] = words[1:]
-            if "DATA" in header:
-                break
+        header = _pcd_header(file)
         start = file.tell()
         sizes = file.read(8)
     try:
