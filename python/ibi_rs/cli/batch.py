@@ -44,7 +44,6 @@ from .common import (
     sha256,
     try_outputs,
     warn,
-    warnings_of,
     write_bop,
     write_json,
 )
@@ -137,7 +136,7 @@ def batch(
         i, job = new[number], todo[number]
         if not isinstance(found, ibi.JobError):
             found = found if part.symmetries.is_none else found.canonical(part.symmetries)
-            for warning in warnings_of(found):
+            for warning in found.warnings:
                 warn(f"{scenes[i]}: {warning}")
         outcome = _outcome(job, found)
         target = targets[i]

@@ -420,11 +420,6 @@ def _rotation_vector(rotation: Any) -> Any:
     return quaternion[1:] * (2 * np.arctan2(sine, quaternion[0]) / max(sine, 1e-300))
 
 
-def warnings_of(found: ibi.Registration) -> list[str]:
-    """Return what a run found odd, a line each."""
-    return list(getattr(found, "warnings", ()))
-
-
 def sha256(path: Path) -> str:
     """Tell a file's content from any other."""
     digest = hashlib.sha256()
@@ -462,7 +457,7 @@ def as_dict(
             }
             for pose in found
         ],
-        "warnings": warnings_of(found),
+        "warnings": list(found.warnings),
         "stop_reason": str(found.stop_reason),
         "seconds": round(seconds, 4),
         "resolution": found.resolution,

@@ -39,7 +39,6 @@ from .common import (
     symmetries_of,
     try_outputs,
     warn,
-    warnings_of,
     write_bop,
     write_json,
 )
@@ -124,7 +123,7 @@ def register(
     seconds = time.perf_counter() - start
     if not held.is_none:
         found = found.canonical(held)
-    for warning in warnings_of(found):
+    for warning in found.warnings:
         warn(warning)
     show(found, seconds)
     if not held.is_none:
