@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core, _detect
+from ibi_rs._clock import Clock, _left_s
 from ibi_rs._detect import Matches
 from ibi_rs._inputs import (
     Points,
@@ -321,7 +322,7 @@ class Model:
     @property
     def diameter(self) -> float:
         """Largest distance of two points, in data units; measured when first asked for."""
-        return self._source.diameter
+        return self._source.diameter(_num_threads(None), _left_s())
 
     def __len__(self) -> int:
         return len(self._points)
@@ -421,8 +422,11 @@ class Model:
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
             less than 2 % of the points lie behind it, as the viewpoint sees it.
-        num_threads, max_instances, timeout_s, callback
+        num_threads, max_instances, callback
             As in :func:`register`.
+        timeout_s : float, optional
+            Overrides that of ``params``; counted from this call. Where time runs out before the first round,
+            the result is empty.
 
         Returns
         -------
@@ -443,28 +447,52 @@ class Model:
         >>> part = ibi.Model.from_mesh(trimesh.load("part.stl"))                   # doctest: +SKIP
         >>> found = part.detect(trimesh.load("scan.ply"), viewpoint=[0, 0, 0])     # doctest: +SKIP
         """
-        matches = self.correspond(
-            tgt,
-            tgt_normals=tgt_normals,
-            viewpoint=viewpoint,
-            remove_plane=remove_plane,
-            num_threads=num_threads,
-        )
         if params is None:
             params = Params() if viewpoint is None else Params.single_view()
+        params = _overridden(params, max_instances, timeout_s)
+        clock = Clock(params.timeout_s)
+        try:
+            with clock:
+                matches = self.correspond(
+                    tgt,
+                    tgt_normals=tgt_normals,
+                    viewpoint=viewpoint,
+                    remove_plane=remove_plane,
+                    num_threads=num_threads,
+                )
+        except TimeoutError:
+            return self._out_of_time(params, clock)
         if viewpoint is not None and not isinstance(viewpoint, View):
             viewpoint = View(viewpoint, tgt)
-        return self.register(
+        left_s = clock.left_s
+        if left_s == 0.0:
+            return self._out_of_time(params, clock)
+        spent_s = clock.spent_s
+        found = self.register(
             matches.tgt,
             matches.corr,
-            params,
+            params if left_s is None else params.replace(timeout_s=left_s),
             tgt_normals=matches.tgt_normals,
             similarity=matches.similarity,
             viewpoint=viewpoint,
             num_threads=num_threads,
-            max_instances=max_instances,
-            timeout_s=timeout_s,
             callback=callback,
+        )
+        found.params = params
+        if found.stop_reason.name == "timeout" and found.stop_reason.value is not None:
+            found.stop_reason = _timeout(found.stop_reason.value + spent_s, params)
+        return found
+
+    def _out_of_time(self, params: Params, clock: Clock) -> Registration:
+        """Nothing, as no round was played; what the scene's spacing is nobody knows."""
+        return Registration(
+            [],
+            labels=np.empty(0, dtype=np.int32),
+            rounds="[]",
+            stop_reason=_timeout(clock.spent_s, params),
+            timings=Timings(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, clock.spent_s),
+            resolution=self.spacing if params.resolution is None else params.resolution,
+            params=params,
         )
 
     def register(
@@ -486,16 +514,9 @@ class Model:
 
         Parameters, returns, raises: those of :func:`register`.
         """
-        params = params if params is not None else _DEFAULT
-        if not isinstance(params, Params):
-            raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+        params = _overridden(_DEFAULT if params is None else params, max_instances, timeout_s)
         if callback is not None and not callable(callback):
             raise TypeError(f"callback must be callable, not {type(callback).__name__}")
-        overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
-        overrides = {name: value for name, value in overrides.items() if value is not None}
-        if overrides:
-            params = params.replace(**overrides)
-
         eye, measured = _camera(viewpoint)
         target, pairs, own = _points("tgt", tgt), _correspondences(corr), params._own()
         # Copies the scene for them, so only where there is one.
@@ -515,6 +536,20 @@ class Model:
             **({} if run is None else {name: run.stage(name, stage) for name, stage in own.items()}),
         )
         return _registration(raw, params)
+
+
+def _overridden(params: Params, max_instances: int | None, timeout_s: float | None) -> Params:
+    if not isinstance(params, Params):
+        raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+    overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
+    overrides = {name: value for name, value in overrides.items() if value is not None}
+    return params.replace(**overrides) if overrides else params
+
+
+def _timeout(spent_s: float, params: Params) -> StopReason:
+    """The stop reason, in the words of the core."""
+    message = f"timeout: {spent_s:.3f} s passed, {params.timeout_s:g} s allowed"
+    return StopReason("timeout", message, spent_s, params.timeout_s)
 
 
 def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:

@@ -42,6 +42,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
+from ._inputs import _num_threads
 from .symmetries import Symmetries, _as_symmetries
 
 __all__ = [
