@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
+from ibi_rs._clock import _left_s
 from ibi_rs._inputs import _aligned, _count, _num_threads, _number, _real
 
 
@@ -84,6 +85,7 @@ def match(
         bool(mutual),
         None if ratio is None else _number("ratio", ratio),
         _num_threads(num_threads),
+        _left_s(),
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core, _detect, _doubts
+from ibi_rs._clock import Clock, _left_s
 from ibi_rs._detect import Matches
 from ibi_rs._inputs import (
     Points,
@@ -329,7 +330,7 @@ class Model:
     @property
     def diameter(self) -> float:
         """Largest distance of two points, in data units; measured when first asked for."""
-        return self._source.diameter
+        return self._source.diameter(_num_threads(None), _left_s())
 
     def __len__(self) -> int:
         return len(self._points)
@@ -522,8 +523,11 @@ class Model:
             Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts
             is the box around all points but the outermost hundredth on each side; fewer than 100 points tell
             nothing.
-        num_threads, max_instances, timeout_s, callback
+        num_threads, max_instances, callback
             As in :func:`register`.
+        timeout_s : float, optional
+            Overrides that of ``params``; counted from this call. Where time runs out before the first round,
+            the result is empty.
 
         Returns
         -------
@@ -548,28 +552,38 @@ class Model:
         >>> part = ibi.Model.from_mesh(trimesh.load("part.stl"))                   # doctest: +SKIP
         >>> found = part.detect(trimesh.load("scan.ply"), viewpoint=[0, 0, 0])     # doctest: +SKIP
         """
-        matches, points = self._match(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
         if params is None:
             params = Params() if viewpoint is None else Params.single_view()
-        if matches.voxel > self._voxel and isinstance(params, Params) and params.resolution is None:
+        params = _limited(params, max_instances, timeout_s)
+        clock = Clock(params.timeout_s)
+        try:
+            with clock:
+                matches, points = self._match(
+                    tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads
+                )
+        except TimeoutError:
+            return _nothing(params, self.spacing, clock)
+        if matches.voxel > self._voxel and params.resolution is None:
             params = params.replace(resolution=matches.voxel / _detect.VOXELS_PER_SPACING)
         if viewpoint is not None and not isinstance(viewpoint, View):
             viewpoint = View(viewpoint, points)
-        if len(matches.corr) == 0:
-            found = _nothing(_limited(params, max_instances, timeout_s), self.spacing)
+        if clock.left_s == 0.0 or len(matches.corr) == 0:
+            found = _nothing(params, self.spacing, clock)
         else:
+            spent_s = clock.spent_s
             found = self.register(
                 matches.tgt,
                 matches.corr,
-                params,
+                params if clock.left_s is None else params.replace(timeout_s=clock.left_s),
                 tgt_normals=matches.tgt_normals,
                 similarity=matches.similarity,
                 viewpoint=viewpoint,
                 num_threads=num_threads,
-                max_instances=max_instances,
-                timeout_s=timeout_s,
                 callback=callback,
             )
+            found.params = params
+            if found.stop_reason.name == "timeout":
+                found.stop_reason = _timeout(found.timings.total_s + spent_s, params)
         found.warnings = matches.warnings
         if len(found) == 0 and len(points) >= _doubts.ENOUGH and found.stop_reason.name not in _STOPPED:
             doubt = _doubts.unit_warning(self.diameter, _detect.standing(points, _camera(viewpoint)[0]))
@@ -637,21 +651,30 @@ def _limited(params: Params | None, max_instances: int | None, timeout_s: float 
     return params.replace(**overrides) if overrides else params
 
 
-def _nothing(params: Params, spacing: float) -> Registration:
-    """Return what a scan gives that holds nothing to register."""
+def _nothing(params: Params, spacing: float, clock: Clock) -> Registration:
+    """Return what a scan gives that holds nothing to register, or for which there was no time."""
     message = f"few_correspondences: 0 alive, {_MIN_CORRESPONDENCES} needed"
+    spent_s = clock.spent_s
     return Registration(
         [],
         labels=np.empty(0, np.int32),
         rounds="[]",
-        stop_reason=StopReason("few_correspondences", message, 0, _MIN_CORRESPONDENCES),
-        timings=Timings(*[0.0] * len(fields(Timings))),
+        stop_reason=_timeout(spent_s, params)
+        if clock.left_s == 0.0
+        else StopReason("few_correspondences", message, 0, _MIN_CORRESPONDENCES),
+        timings=Timings(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, spent_s),
         resolution=spacing if params.resolution is None else params.resolution,
         params=params,
     )
 
 
 _MIN_CORRESPONDENCES = 3
+
+
+def _timeout(spent_s: float, params: Params) -> StopReason:
+    """Say it in the words of the core."""
+    message = f"timeout: {spent_s:.3f} s passed, {params.timeout_s:g} s allowed"
+    return StopReason("timeout", message, spent_s, params.timeout_s)
 
 
 def _on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:

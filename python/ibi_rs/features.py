@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
+from ibi_rs._clock import _left_s
 from ibi_rs._inputs import (
     Points,
     _count,
@@ -83,7 +84,11 @@ def voxel_downsample(
     [[0.0, 0.0, 0.1], [0.0, 0.0, 5.0]]
     """
     return _core.features_voxel_downsample(
-        _points("points", points), _optional("normals", normals), _number("voxel", voxel), _num_threads(None)
+        _points("points", points),
+        _optional("normals", normals),
+        _number("voxel", voxel),
+        _num_threads(None),
+        _left_s(),
     )
 
 
@@ -150,6 +155,7 @@ def estimate_normals(
         _count("max_neighbors", max_neighbors, 3),
         None if viewpoint is None else _viewpoint(viewpoint),
         _num_threads(num_threads),
+        _left_s(),
     )
 
 
@@ -220,6 +226,7 @@ def fpfh(
         _count("max_neighbors", max_neighbors, 2),
         None if keypoints is None else _rows("keypoints", keypoints),
         _num_threads(num_threads),
+        _left_s(),
     )
 
 
@@ -314,6 +321,7 @@ def dominant_plane(
         None if viewpoint is None else _viewpoint(viewpoint),
         _seed(seed),
         _num_threads(num_threads),
+        _left_s(),
     )
     if found is None:
         return None

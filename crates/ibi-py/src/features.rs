@@ -44,6 +44,8 @@ fn features_voxel_downsample<'py>(
 ) -> PyResult<(Floats<'py>, Option<Floats<'py>>)> {
     let points = rows3(&points, Point3::new)?;
     let normals = normals.map(|normals| rows3(&normals, Vector3::new)).transpose()?;
+    // Of fewer points a second thread is not worth its start.
+    let num_threads = if points.len() < 50_000 { Some(1) } else { num_threads };
     let thinned = in_pool(py, num_threads, timeout_s, |interrupt| {
         features::voxel_downsample(&points, normals.as_deref(), voxel, interrupt)
     })?;

@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 use std::sync::Arc;
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ibi_core::kernels::par::Pool;
 use ibi_core::nalgebra::{Matrix3, Point3, Vector3};
@@ -12,7 +12,7 @@ use ibi_core::{
 };
 use numpy::ndarray::ArrayView2;
 use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
-use pyo3::exceptions::{PySystemExit, PyValueError};
+use pyo3::exceptions::{PySystemExit, PyTimeoutError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -59,10 +59,14 @@ impl Source {
         self.0.spacing
     }
 
-    #[getter]
-    fn diameter(&self, py: Python<'_>) -> PyResult<f64> {
-        // Interrupted by a signal alone, which is then raised.
-        in_pool(py, None, |interrupt| Ok(self.0.diameter(interrupt).unwrap_or(f64::NAN)))
+    /// With `timeout_s`, counted from the call, a `TimeoutError` says that time has run out.
+    #[pyo3(signature = (num_threads, timeout_s=None))]
+    fn diameter(&self, py: Python<'_>, num_threads: Option<usize>, timeout_s: Option<f64>) -> PyResult<f64> {
+        let start = Instant::now();
+        in_pool(py, num_threads, |interrupt| {
+            let diameter = self.0.diameter(&interrupt.clone().with_timeout(start, timeout_s));
+            diameter.ok_or_else(|| PyTimeoutError::new_err("interrupted"))
+        })
     }
 }
 

@@ -14,6 +14,7 @@ use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::grid::buckets;
 use crate::kernels::par;
 use crate::kernels::sight::{across, direction};
+use crate::kernels::sort::sorted;
 use crate::pace::Pace;
 
 /// From where the part is looked at.
@@ -50,7 +51,8 @@ const AT_ONCE: usize = 4;
 /// `views` is out of its range.
 ///
 /// # Complexity
-/// For each direction O(faces), and a few faces for each point that was not seen yet.
+/// O(faces log faces); then for each direction O(faces), and far fewer where few points were not seen yet, and a few faces
+/// for each of them.
 pub fn outer_surface(
     points: &[Point3<f64>],
     normals: &[Vector3<f64>],
@@ -68,6 +70,7 @@ pub fn outer_surface(
         return Err(FeatureError::Interrupted);
     }
     let cos = views.max_angle_rad.cos();
+    let patches = Patches::new(mesh, low, high, interrupt).ok_or(FeatureError::Interrupted)?;
     let mut is_seen = vec![false; points.len()];
     // Side by side, although one of them may look again at what another one sees.
     let at_once = if par::is_parallel() { AT_ONCE } else { 1 };
@@ -78,7 +81,7 @@ pub fn outer_surface(
             let rows: Vec<usize> = (0..points.len()).filter(facing).collect();
             let lifted = |&row: &usize| points[row] + lift * normals[row];
             let asked: Vec<Point3<f64>> = rows.iter().map(lifted).collect();
-            let screen = Screen::new(mesh, low, to_eye, 1e-9 * size, &asked, interrupt);
+            let screen = Screen::new(&patches, to_eye, 1e-9 * size, &asked, interrupt);
             let seen = par::chunks(rows.len(), GRAIN, |run| {
                 let is_asked = !interrupt.is_set();
                 let sees = |&at: &usize| is_asked && screen.sees(&asked[at]);
@@ -117,14 +120,55 @@ fn bounds(points: &[Point3<f64>]) -> (Point3<f64>, Point3<f64>) {
     points.iter().fold((first, first), |(low, high), p| (low.inf(p), high.sup(p)))
 }
 
+/// Faces of a patch.
+const PATCH: usize = 32;
+
+/// The faces in patches that lie together, whatever their order in the mesh.
+struct Patches<'a> {
+    mesh: &'a Mesh<'a>,
+    low: Point3<f64>,
+    high: Point3<f64>,
+    order: Vec<u32>,
+    /// The middle of the box around each patch, and half its sides.
+    boxes: Vec<(Point3<f64>, Vector3<f64>)>,
+}
+
+impl<'a> Patches<'a> {
+    /// `low` and `high` are the corners of the box around the mesh. `None` if interrupted.
+    fn new(mesh: &'a Mesh<'a>, low: Point3<f64>, high: Point3<f64>, interrupt: &Interrupt) -> Option<Self> {
+        /// Cells an axis, of a curve that winds through all of them (Morton 1966).
+        const CELLS: f64 = 65536.0;
+        let scale = (high - low).map(|side| if side > 0.0 { CELLS * (1.0 - 1e-9) / side } else { 0.0 });
+        let place = |face: usize| {
+            let centre = mesh.corners(face).iter().map(|p| p - low).sum::<Vector3<f64>>() / 3.0;
+            let [x, y, z] = [0, 1, 2].map(|k| (centre[k] * scale[k]) as u64);
+            (0..16).fold(0, |code, bit| {
+                code | ((x >> bit) & 1) << (3 * bit)
+                    | ((y >> bit) & 1) << (3 * bit + 1)
+                    | ((z >> bit) & 1) << (3 * bit + 2)
+            })
+        };
+        let places = par::chunks(mesh.faces.len(), GRAIN, |run| {
+            let is_asked = !interrupt.is_set();
+            run.filter(|_| is_asked).map(|face| (place(face), face as u32)).collect::<Vec<(u64, u32)>>()
+        });
+        let order: Vec<u32> = sorted(places.concat(), interrupt)?.into_iter().map(|(_, face)| face).collect();
+        let boxes = par::chunks(order.len(), PATCH, |run| {
+            let corners = order[run].iter().flat_map(|&face| mesh.corners(face as usize));
+            let nowhere = (Point3::from([f64::INFINITY; 3]), Point3::from([f64::NEG_INFINITY; 3]));
+            let (low, high) = corners.fold(nowhere, |(low, high), p| (low.inf(&p), high.sup(&p)));
+            (nalgebra::center(&low, &high), 0.5 * (high - low))
+        });
+        Some(Self { mesh, low, high, order, boxes })
+    }
+}
+
 /// The mesh as seen from one direction: the faces that each pixel shows, where somebody asks.
 struct Screen<'a> {
     mesh: &'a Mesh<'a>,
     /// Right, up and towards the eye.
     axes: [Vector3<f64>; 3],
     origin: Point3<f64>,
-    /// On the screen.
-    vertices: Vec<[f64; 3]>,
     low: [f64; 2],
     inv_pixel: f64,
     shape: [usize; 2],
@@ -145,65 +189,79 @@ const WIDE: usize = 4;
 impl<'a> Screen<'a> {
     /// For questions about the points `asked`. Less than all if interrupted.
     fn new(
-        mesh: &'a Mesh<'a>,
-        origin: Point3<f64>,
+        patches: &Patches<'a>,
         to_eye: Vector3<f64>,
         rounding: f64,
         asked: &[Point3<f64>],
         interrupt: &Interrupt,
     ) -> Self {
         let [right, up] = across(&to_eye);
+        let (mesh, origin) = (patches.mesh, patches.low);
         let axes = [right, up, to_eye];
-        let mut pace = Pace::new(interrupt);
-        let vertices = mesh.vertices.iter().take_while(|_| !asked.is_empty() && !pace.is_over(2));
-        let vertices: Vec<[f64; 3]> = vertices.map(|v| on_screen(&axes, origin, v)).collect();
-        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        for at in &vertices {
-            for k in 0..2 {
-                (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k]));
-            }
-        }
+        let middle = on_screen(&axes, origin, &nalgebra::center(&patches.low, &patches.high));
+        let half = axes.map(|axis| axis.abs().dot(&(0.5 * (patches.high - patches.low))));
         // About as many pixels as faces.
         let side = ((mesh.faces.len() as f64).sqrt() as usize).clamp(8, MAX_SIDE);
-        let [width, height] = [0, 1].map(|k| high[k] - low[k]);
-        let pixel = (width.max(height) / side as f64).max(f64::MIN_POSITIVE);
+        let pixel = (2.0 * half[0].max(half[1]) / side as f64).max(f64::MIN_POSITIVE);
         let mut screen = Self {
             mesh,
             axes,
             origin,
-            low,
+            low: [0, 1].map(|k| middle[k] - half[k]),
             inv_pixel: 1.0 / pixel,
-            shape: [width, height].map(|width| ((width / pixel) as usize + 1).min(side + 1)),
+            shape: [0, 1].map(|k| ((2.0 * half[k] / pixel) as usize + 1).min(side + 1)),
             starts: Vec::new(),
             shown: Vec::new(),
-            vertices,
             rounding,
         };
-        if screen.vertices.len() == mesh.vertices.len() {
-            screen.show(asked, &mut pace);
+        if !asked.is_empty() {
+            screen.show(patches, asked, &mut Pace::new(interrupt));
         }
         screen
     }
 
     /// Sorts the faces by the pixels that they may cover: those that lie before a point that is asked for.
-    fn show(&mut self, asked: &[Point3<f64>], pace: &mut Pace<'_>) {
-        let mut deepest = vec![f64::INFINITY; self.shape[0] * self.shape[1]];
+    fn show(&mut self, patches: &Patches<'_>, asked: &[Point3<f64>], pace: &mut Pace<'_>) {
+        let [width, height] = self.shape;
+        let mut deepest = vec![f64::INFINITY; width * height];
         for point in asked {
             let p = on_screen(&self.axes, self.origin, point);
             let pixel = self.pixel(&p);
             deepest[pixel] = deepest[pixel].min(p[2]);
         }
+        // How many pixels to the left of and below a corner are asked for.
+        let mut below = vec![0_u32; (width + 1) * (height + 1)];
+        for x in 0..width {
+            let mut in_column = 0;
+            for y in 0..height {
+                in_column += u32::from(deepest[x * height + y] < f64::INFINITY);
+                below[(x + 1) * (height + 1) + y + 1] = below[x * (height + 1) + y + 1] + in_column;
+            }
+        }
+        let is_asked = |[left, right]: [usize; 2], [bottom, top]: [usize; 2]| {
+            let at = |x: usize, y: usize| below[x * (height + 1) + y];
+            at(right + 1, top + 1) + at(left, bottom) > at(left, top + 1) + at(right + 1, bottom)
+        };
         let mut shown: Vec<(u32, usize)> = Vec::new();
-        for id in 0..self.mesh.faces.len() {
-            let face = self.corners(id);
-            let nearest = face[0][2].max(face[1][2]).max(face[2][2]);
-            let num_before = shown.len();
-            let num_looked_at = self.each_pixel(&face, |pixel| {
-                if deepest[pixel] < nearest {
-                    shown.push((id as u32, pixel));
-                }
+        for (faces, (middle, half)) in patches.order.chunks(PATCH).zip(&patches.boxes) {
+            let middle = on_screen(&self.axes, self.origin, middle);
+            let pixels = [0, 1].map(|k| {
+                let reach = self.axes[k].abs().dot(half) + self.rounding;
+                [self.along(k, middle[k] - reach), self.along(k, middle[k] + reach)]
             });
-            if pace.is_over(4 + num_looked_at + shown.len() - num_before) {
+            let mut work = 1;
+            if is_asked(pixels[0], pixels[1]) {
+                for &id in faces {
+                    let face = self.corners(id as usize);
+                    let nearest = face[0][2].max(face[1][2]).max(face[2][2]);
+                    work += 8 + self.each_pixel(&face, |pixel| {
+                        if deepest[pixel] < nearest {
+                            shown.push((id, pixel));
+                        }
+                    });
+                }
+            }
+            if pace.is_over(work) {
                 return;
             }
         }
@@ -211,7 +269,7 @@ impl<'a> Screen<'a> {
     }
 
     fn corners(&self, face: usize) -> [[f64; 3]; 3] {
-        self.mesh.faces[face].map(|vertex| self.vertices[vertex])
+        self.mesh.corners(face).map(|vertex| on_screen(&self.axes, self.origin, &vertex))
     }
 
     /// Tells `look` all pixels that a face may cover, and others; returns how many.

@@ -14,7 +14,7 @@ use super::par;
 use crate::interrupt::Interrupt;
 
 /// Points of a tree at most. Building one cannot be interrupted, so a larger cloud has several, side by side.
-const MOST: usize = 1 << 15;
+const MOST: usize = 1 << 17;
 
 /// A kd-tree over a cloud; ids are the rows of the cloud it was built from.
 pub struct Neighbors {
