@@ -80,6 +80,10 @@ bench-piles: $(STAMPS)/package $(STAMPS)/group-test $(STAMPS)/open3d peers pcl #
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py
 
+.PHONY: bench-limits
+bench-limits: $(STAMPS)/package ## time against size on the worst inputs, and how late a limit ends them; ARGS=--docs records
+	$(BIN)/python benchmarks/limits.py $(ARGS)
+
 .PHONY: bench-features
 bench-features: $(STAMPS)/package $(STAMPS)/open3d ## time the built-in features against Open3D, write the record (needs Open3D)
 	$(BIN)/python benchmarks/features.py

@@ -14,6 +14,7 @@ from ibi_rs._core import InputError
 Points = Any
 """(N, 3) real numbers, or an object with ``.points``, ``.vertices``, ``__array__`` or ``__dlpack__``."""
 
+# More than a few for each core are not started: the core sees to that.
 _MAX_THREADS = 65535
 """As many as rayon can tell apart."""
 

@@ -1,7 +1,8 @@
 //! What accepted instances explain of the scene, and is therefore not free for others.
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 
+use crate::ledger::Ledger;
 use crate::params::Params;
 use crate::scene::Scene;
 use crate::state::Found;
@@ -16,44 +17,50 @@ pub struct Claims<'a> {
     found: &'a [Found],
     /// An instance against all others: its is what it is nearest to.
     defendant: Option<usize>,
+    /// Who explains what, where that was worked out for all beforehand, and who competes no more.
+    ledger: Option<&'a Ledger<'a>>,
 }
 
 impl<'a> Claims<'a> {
     /// What is not free any more: the claims of all.
     pub(crate) fn new(scene: &'a Scene<'a>, params: &Params, found: &'a [Found]) -> Self {
-        Self { scene, distance_pr: params.d_op_pr, found, defendant: None }
+        Self { scene, distance_pr: params.d_op_pr, found, defendant: None, ledger: None }
     }
 
-    /// What others explain better than the instance does; of equals the one found first.
-    pub(crate) fn against(self, instance: usize) -> Self {
-        Self { defendant: Some(instance), ..self }
+    /// What others of the ledger explain better than the instance does; of equals the one found first.
+    pub(crate) fn against(self, instance: usize, ledger: &'a Ledger<'a>) -> Self {
+        Self { defendant: Some(instance), ledger: Some(ledger), ..self }
     }
 
     /// The poses of the instances that claim, in the order they were found.
     pub fn poses(&self) -> impl Iterator<Item = &'a Isometry3<f64>> + use<'a> {
-        let Self { found, defendant, .. } = *self;
-        (0..found.len()).filter(move |&at| Some(at) != defendant).map(|at| found[at].pose())
+        let claims = *self;
+        (0..self.found.len()).filter(move |&at| claims.is_claimant(at)).map(move |at| claims.found[at].pose())
     }
 
     /// Whether an accepted instance explains a row of the target. For many rows near one pose ask [`Self::near`].
     #[must_use]
     pub fn contains(&self, row: u32) -> bool {
-        self.of(|_| true).contain(&[row])[0]
+        self.of(None).contain(&[row])[0]
     }
 
     /// The claims that matter for target points within 2 `d_op` of the source as a pose has moved it.
     #[must_use]
     pub fn near(&self, target_from_source: &Isometry3<f64>) -> NearClaims<'a> {
-        let source = self.scene.source;
-        let reach = 2.0 * source.radius + 3.0 * self.distance_pr * self.scene.resolution;
-        let centre = target_from_source * source.centre;
-        self.of(|other| (other * source.centre - centre).norm() <= reach)
+        self.of(Some(target_from_source * self.scene.source.centre))
     }
 
-    fn of(&self, is_near: impl Fn(&Isometry3<f64>) -> bool) -> NearClaims<'a> {
-        let Self { found, defendant, .. } = *self;
-        let is_claimant = |&at: &usize| defendant != Some(at) && is_near(found[at].pose());
-        NearClaims { claims: *self, near: (0..found.len()).filter(is_claimant).collect() }
+    fn of(&self, centre: Option<Point3<f64>>) -> NearClaims<'a> {
+        let Self { scene, distance_pr, .. } = *self;
+        let near = (0..self.found.len()).filter(|&at| {
+            let is_near = |centre| are_near(scene, distance_pr, self.found[at].pose(), centre);
+            self.is_claimant(at) && centre.as_ref().is_none_or(is_near)
+        });
+        NearClaims { claims: *self, centre, near: near.collect() }
+    }
+
+    fn is_claimant(&self, instance: usize) -> bool {
+        self.defendant != Some(instance) && self.ledger.is_none_or(|ledger| ledger.holds(instance))
     }
 
     /// Of `rows` of the target, each given with a key, those that an instance explains, and how far they are from it.
@@ -68,10 +75,23 @@ impl<'a> Claims<'a> {
     }
 }
 
+/// Whether a pose can explain target points within 2 `d_op` of the source where another one has moved its centre to `centre`.
+pub(crate) fn are_near(
+    scene: &Scene<'_>,
+    distance_pr: f64,
+    pose: &Isometry3<f64>,
+    centre: &Point3<f64>,
+) -> bool {
+    let reach = 2.0 * scene.source.radius + 3.0 * distance_pr * scene.resolution;
+    (pose * scene.source.centre - centre).norm() <= reach
+}
+
 /// [`Claims`] of the instances that can have to do with the target points near a pose.
 #[derive(Debug)]
 pub struct NearClaims<'a> {
     claims: Claims<'a>,
+    /// Where the pose has moved the centre of the source to; `None`: all instances count.
+    centre: Option<Point3<f64>>,
     near: Vec<usize>,
 }
 
@@ -79,6 +99,26 @@ impl NearClaims<'_> {
     /// Which of `rows` of the target one of the instances explains.
     #[must_use]
     pub fn contain(&self, rows: &[u32]) -> Vec<bool> {
+        let Claims { scene, distance_pr, found, defendant, ledger } = self.claims;
+        let Some(ledger) = ledger.filter(|_| !self.near.is_empty()) else { return self.worked_out(rows) };
+        let is_near = |instance: usize| {
+            self.centre
+                .as_ref()
+                .is_none_or(|centre| are_near(scene, distance_pr, found[instance].pose(), centre))
+        };
+        let known: Vec<Option<bool>> =
+            rows.iter().map(|&row| ledger.is_claimed(row, defendant, is_near)).collect();
+        let unknown: Vec<u32> =
+            rows.iter().zip(&known).filter(|(_, known)| known.is_none()).map(|(&row, _)| row).collect();
+        if unknown.is_empty() {
+            return known.into_iter().flatten().collect();
+        }
+        let mut worked_out = self.worked_out(&unknown).into_iter();
+        known.into_iter().map(|known| known.or_else(|| worked_out.next()).unwrap_or_default()).collect()
+    }
+
+    /// The same by asking each instance.
+    fn worked_out(&self, rows: &[u32]) -> Vec<bool> {
         let claims = &self.claims;
         let keyed = || rows.iter().copied().enumerate();
         // The best claim to each row: how far it is from the instance, and from which.

@@ -10,7 +10,7 @@ use crate::checks::{first_not_finite, unit_vectors};
 use crate::error::{Argument, Error};
 use crate::interrupt::Interrupt;
 use crate::kernels::columns::middle;
-use crate::kernels::nearby::spacing;
+use crate::kernels::nearby::spacing_until;
 use crate::kernels::neighbors::Neighbors;
 use crate::kernels::overlap::Surface;
 use crate::kernels::rng::Rng;
@@ -124,7 +124,7 @@ impl<'a> PreparedCloud<'a> {
     /// # Errors
     /// Those of [`crate::Registrar::new`].
     pub fn source(cloud: &Cloud<'a>) -> Result<Self, Error> {
-        Self::new(cloud, Argument::Src, Argument::SrcNormals, Argument::SrcFrames)
+        Self::new(cloud, Argument::Src, Argument::SrcNormals, Argument::SrcFrames, &Interrupt::never())
     }
 
     /// Checks `cloud` and builds what the stages need. `argument`, `normals` and `frames` are what errors call them.
@@ -133,6 +133,7 @@ impl<'a> PreparedCloud<'a> {
         argument: Argument,
         normals: Argument,
         frames: Argument,
+        interrupt: &Interrupt,
     ) -> Result<Self, Error> {
         let points = &cloud.points;
         check_points(points, argument)?;
@@ -157,7 +158,8 @@ impl<'a> PreparedCloud<'a> {
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
         }
-        let spacing = spacing(points);
+        let spacing = spacing_until(points, || interrupt.is_set()).ok_or_else(|| interrupt.error())?;
+        interrupt.proceed()?;
         // Of the bulk: a stray point far off may be held as coarsely as it likes.
         let distance = middle(points).amax();
         let step = distance.next_up() - distance;

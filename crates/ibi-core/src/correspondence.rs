@@ -6,6 +6,7 @@ use nalgebra::{Point3, Vector3};
 
 use crate::cloud::{PreparedCloud, check_points};
 use crate::error::{Argument, Error};
+use crate::interrupt::Interrupt;
 use crate::kernels::by_target::ByTarget;
 use crate::kernels::columns::Columns;
 use crate::kernels::graph::{PairNormals, up_to_sign};
@@ -55,15 +56,22 @@ impl Correspondences {
     }
 
     /// Rows of the clouds, source and target; where points are given instead, those of the nearest points.
-    fn rows(&self, clouds: &Clouds<'_>) -> (Vec<u32>, Vec<u32>) {
+    fn rows(&self, clouds: &Clouds<'_>, interrupt: &Interrupt) -> Result<(Vec<u32>, Vec<u32>), Error> {
+        /// Points that are looked up before the clock is looked at.
+        const CHUNK: usize = 1024;
         let side = |cloud: &PreparedCloud<'_>, column: usize| match &self.pairs {
-            Pairs::Rows(rows) => rows.iter().map(|row| row[column] as u32).collect(),
+            Pairs::Rows(rows) => Ok(rows.iter().map(|row| row[column] as u32).collect()),
             Pairs::Points(points) => {
                 let nearest = |pair: &[Point3<f64>; 2]| cloud.tree().nearest(&pair[column]);
-                points.iter().filter_map(nearest).map(|(row, _)| row).collect()
+                let mut rows = Vec::with_capacity(points.len());
+                for points in points.chunks(CHUNK) {
+                    interrupt.proceed()?;
+                    rows.extend(points.iter().filter_map(nearest).map(|(row, _)| row));
+                }
+                Ok(rows)
             }
         };
-        (side(clouds.source, 0), side(&clouds.target, 1))
+        Ok((side(clouds.source, 0)?, side(&clouds.target, 1)?))
     }
 
     /// M, the number of correspondences.
@@ -101,10 +109,17 @@ pub struct PointPairs {
     pub similarity: Option<Vec<f64>>,
     /// Normals at both points of each pair.
     pub normals: Option<PairNormals>,
+    /// Whether they are pairs of rows, and no points of their own.
+    pub(crate) are_rows: bool,
 }
 
 impl PointPairs {
-    pub(crate) fn new(given: &Correspondences, clouds: &Clouds<'_>, oriented: bool) -> Result<Self, Error> {
+    pub(crate) fn new(
+        given: &Correspondences,
+        clouds: &Clouds<'_>,
+        oriented: bool,
+        interrupt: &Interrupt,
+    ) -> Result<Self, Error> {
         let len = given.len();
         if len > u32::MAX as usize {
             return Err(Error::TooMany { argument: Argument::Corr, len });
@@ -118,7 +133,9 @@ impl PointPairs {
         };
         check_points(&source, Argument::Corr)?;
         check_points(&target, Argument::Corr)?;
-        let (source_rows, target_rows) = given.rows(clouds);
+        interrupt.proceed()?;
+        let (source_rows, target_rows) = given.rows(clouds, interrupt)?;
+        interrupt.proceed()?;
         let columns = Arc::new(Columns::new(&source, &target, clouds.resolution));
         let by_target = ByTarget::new(&columns);
         let normals = clouds.source.normals.as_ref().zip(clouds.target.normals.as_ref()).map(|(s, t)| {
@@ -128,29 +145,49 @@ impl PointPairs {
             PairNormals { source: look_up(s, &source_rows), target: look_up(t, &target_rows), oriented }
         });
         let similarity = given.similarity.clone();
-        Ok(Self { source, target, source_rows, target_rows, columns, by_target, similarity, normals })
+        let are_rows = matches!(given.pairs, Pairs::Rows(_));
+        Ok(Self {
+            source,
+            target,
+            source_rows,
+            target_rows,
+            columns,
+            by_target,
+            similarity,
+            normals,
+            are_rows,
+        })
     }
 
     /// For each source point the share of the correspondences whose source point lies within `t_he` of it (and
     /// agrees in its normal, where normals count): how likely a correspondence that knows nothing of its target
     /// point would agree there.
-    pub(crate) fn chances(&self, scene: &Scene<'_>, params: &Params) -> Vec<f32> {
+    pub(crate) fn chances(&self, scene: &Scene<'_>, params: &Params, interrupt: &Interrupt) -> Vec<f32> {
+        /// Points of like normals that are looked at around one, at most.
+        const MOST_NEAR: usize = 1 << 12;
         let source = scene.source;
         let t_he = params.t_he_pr * scene.resolution;
+        let is_wide = scene.near_source.is_crowded(t_he);
         let mut uses = vec![0_u32; source.points.len()];
         for &row in &self.source_rows {
             uses[row as usize] += 1;
         }
         let near = if let Some((n, min_cos)) = source.normals.as_deref().zip(params.min_normal_cos) {
             par::map(source.points.len(), 512, |row| {
+                if row % 64 == 0 && interrupt.is_set() {
+                    return 0;
+                }
                 let alike = |&other: &u32| {
                     up_to_sign(n[row].dot(&n[other as usize]), params.oriented_normals) >= min_cos
                 };
-                let near = scene.near_source.within(&source.points[row], t_he).filter(alike);
-                near.map(|other| uses[other as usize]).sum::<u32>()
+                let near = || scene.near_source.within(&source.points[row], t_he);
+                // Of more than so many every so many-th stands for all.
+                let step = if is_wide { near().count().div_ceil(MOST_NEAR).max(1) } else { 1 };
+                let near = near().step_by(step).filter(alike);
+                near.map(|other| uses[other as usize]).sum::<u32>().saturating_mul(step as u32)
             })
         } else {
-            scene.near_source.sums_within(t_he, &source.points, &uses)
+            scene.near_source.sums_within_until(t_he, &source.points, &uses, || interrupt.is_set())
         };
         near.into_iter().map(|num| num as f32 / self.len().max(1) as f32).collect()
     }

@@ -1,5 +1,7 @@
 //! What can be wrong with the input. Finding nothing is not an error, see [`crate::StopReason`].
 
+use crate::registration::StopReason;
+
 /// Why a call was refused. Every message is one line that names the argument, the place and what is allowed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -128,6 +130,13 @@ pub enum Error {
         large: Argument,
         /// Mean nearest-neighbour distance of the other.
         spacing: f64,
+    },
+    /// A limit struck, or the run was cancelled, before its first round: [`crate::Registrar::register`] makes an empty result
+    /// of it.
+    #[error("ended while it was prepared: {reason}")]
+    Interrupted {
+        /// Which limit, or that it was cancelled.
+        reason: StopReason,
     },
     /// More correspondences, or points, than 32-bit ids can name.
     #[error("{argument} has {len} rows; at most {} are supported", u32::MAX)]

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use crate::error::Error;
 use crate::registration::StopReason;
 
 /// Cancels the runs it was handed to, from any thread.
@@ -13,7 +14,7 @@ use crate::registration::StopReason;
 pub struct CancelToken(Arc<AtomicBool>);
 
 impl CancelToken {
-    /// Asks the runs to stop; they do within milliseconds and keep what they have found.
+    /// Asks the runs to stop; they do within milliseconds and keep what they have found and could still check.
     pub fn cancel(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
@@ -146,6 +147,20 @@ impl Interrupt {
     #[must_use]
     pub fn is_set(&self) -> bool {
         self.token.is_cancelled() || self.elapsed_s() >= self.timeout_s
+    }
+
+    /// An error once the computation is to end.
+    pub(crate) fn proceed(&self) -> Result<(), Error> {
+        match self.check() {
+            ControlFlow::Break(reason) => Err(Error::Interrupted { reason }),
+            ControlFlow::Continue(()) => Ok(()),
+        }
+    }
+
+    /// What is returned once the computation has been found to be set.
+    pub(crate) fn error(&self) -> Error {
+        // Once set it stays so.
+        self.proceed().err().unwrap_or(Error::Interrupted { reason: StopReason::Cancelled })
     }
 
     pub(crate) fn check(&self) -> ControlFlow<StopReason> {

@@ -65,7 +65,8 @@ pub struct Params {
     /// A run ends with this many instances; `None`: no limit.
     #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub max_instances: Option<u32>,
-    /// A run ends after this many seconds and keeps what it has; `None`: no limit. >= 0.
+    /// A run ends after this many seconds and keeps what it has; `None`: no limit. What was found by then is still checked and
+    /// ranked as far as a bounded amount of work goes, see [`crate::Registrar::finish`]. >= 0.
     #[cfg_attr(feature = "serde", serde(deserialize_with = "none_or"))]
     pub timeout_s: Option<f64>,
 }

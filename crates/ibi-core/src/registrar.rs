@@ -9,11 +9,12 @@ use nalgebra::Isometry3;
 use crate::cloud::{Cloud, PreparedCloud, check_points};
 use crate::correspondence::{Correspondences, PointPairs};
 use crate::error::{Argument, Error};
+use crate::finish::{self, Grace};
 use crate::interrupt::{CancelToken, Interrupt, Phase, Watcher};
 use crate::joint::{joint_check, supports};
 use crate::kernels::graph::Graph;
 use crate::kernels::par::{self, Pool};
-use crate::params::{Params, Removal};
+use crate::params::{Params, Refine, Removal};
 use crate::registration::{Registration, Round, StopReason, Timings};
 use crate::scene::{Clouds, Detail, Scene};
 use crate::stages::{Context, Enhance, EstimatePose, Hypothesis, Polished, Ranked, SelectSeeds, Validate};
@@ -106,8 +107,8 @@ impl<'a> Registrar<'a> {
         self
     }
 
-    /// Threads per run. Default: as many as the process may use. The result does not depend on it. They are kept for the next
-    /// run that wants as many.
+    /// Threads per run. Default: as many as the process may use. The result does not depend on it. Four for each core (or
+    /// eight) are started at most, and those of no more than the cores are kept for the next run that wants as many.
     #[must_use]
     pub fn num_threads(mut self, num_threads: usize) -> Self {
         self.num_threads = Some(num_threads);
@@ -178,10 +179,18 @@ impl<'a> Registrar<'a> {
         correspondences: &Correspondences,
         observer: &mut dyn Observer,
     ) -> Result<Registration, Error> {
+        let start = Instant::now();
         let pool = Arc::new(Pool::new(self.num_threads)?);
         // Once and not for each step: to hand a job to other threads takes its time.
         pool.install(|| {
-            let mut state = self.begin_on(&pool, target, correspondences)?;
+            let mut state = match self.begin_on(&pool, target, correspondences) {
+                Ok(state) => state,
+                Err(Error::Interrupted { reason }) => {
+                    let resolution = self.params.resolution.unwrap_or_default();
+                    return Ok(Registration::empty(correspondences.len(), reason, start, resolution));
+                }
+                Err(error) => return Err(error),
+            };
             let stop_reason = self.run(&mut state, observer);
             Ok(self.finish(state, stop_reason))
         })
@@ -193,6 +202,7 @@ impl<'a> Registrar<'a> {
     /// If a parameter is out of range; if the seed selection needs an argument that is not given; if the target is as
     /// bad as a source may be (see [`Self::new`]); if a correspondence points outside of a cloud; if only one cloud has
     /// normals or frames; if the clouds cannot be in the same unit; if the threads cannot be started.
+    /// [`Error::Interrupted`] if a limit strikes or the run is cancelled meanwhile.
     pub fn begin<'s>(
         &'s self,
         target: &Cloud<'s>,
@@ -208,6 +218,10 @@ impl<'a> Registrar<'a> {
         correspondences: &Correspondences,
     ) -> Result<State<'s>, Error> {
         let start = Instant::now();
+        let mut interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
+        if let Some(watcher) = &self.watcher {
+            interrupt = interrupt.with_watcher(Arc::clone(watcher));
+        }
         self.params.validate()?;
         if let Some(argument) = self.scs().needs()
             && !self.is_given(argument, target, correspondences)
@@ -215,23 +229,27 @@ impl<'a> Registrar<'a> {
             return Err(Error::Missing { argument });
         }
         let (scene, pairs) = pool.install(|| {
-            let prepared =
-                PreparedCloud::new(target, Argument::Tgt, Argument::TgtNormals, Argument::TgtFrames)?;
+            interrupt.begin(Phase::Prepare);
+            let prepared = PreparedCloud::new(
+                target,
+                Argument::Tgt,
+                Argument::TgtNormals,
+                Argument::TgtFrames,
+                &interrupt,
+            )?;
             let measured = target.measured.as_deref();
             if let Some(points) = measured {
                 check_points(points, Argument::Measured)?;
             }
             let clouds = Clouds::new(&self.source, prepared, &self.params)?;
             let (near, pairs) = par::join(
-                || clouds.near(&self.params),
-                || PointPairs::new(correspondences, &clouds, self.params.oriented_normals),
+                || clouds.near(&self.params, &interrupt),
+                || PointPairs::new(correspondences, &clouds, self.params.oriented_normals, &interrupt),
             );
-            Ok::<_, Error>((Scene::new(clouds, near, measured, &self.params), pairs?))
+            let pairs = pairs?;
+            let scene = Scene::new(clouds, near?, measured, &self.params, &interrupt)?;
+            Ok::<_, Error>((scene, pairs))
         })?;
-        let mut interrupt = Interrupt::new(self.cancel.clone(), start, self.params.timeout_s);
-        if let Some(watcher) = &self.watcher {
-            interrupt = interrupt.with_watcher(Arc::clone(watcher));
-        }
         Ok(State::new(Problem::new(scene, pairs, interrupt), Arc::clone(pool), start))
     }
 
@@ -274,7 +292,10 @@ impl<'a> Registrar<'a> {
                 let flow = self.round(state);
                 // Where the rounds run dry, candidates still waiting may free the way for further ones.
                 match flow {
-                    ControlFlow::Break(reason) if reason.is_dry() && self.settle(state) > 0 => {}
+                    ControlFlow::Break(reason)
+                        if reason.is_dry()
+                            && self.settle(state, &mut Grace::none(&state.problem.interrupt.clone())) > 0 => {
+                    }
                     flow => return flow,
                 }
                 // A round that was played to its end is reported, although it would have ended the run.
@@ -299,15 +320,19 @@ impl<'a> Registrar<'a> {
         }
         let verdict = state.conclude(&self.params, play);
         if verdict.is_some_and(|verdict| verdict.accepted() && self.hv().is_sure(&verdict)) {
-            state.measure_candidates(&self.params, self.hv());
-            state.turn_best(&self.params, self.hv());
-            state.accept_best(&self.params, f64::NEG_INFINITY);
+            let interrupt = state.problem.interrupt.clone();
+            let mut grace = Grace::none(&interrupt);
+            if state.measure_candidates(&self.params, self.hv(), &mut grace)
+                && state.turn_best(&self.params, self.hv(), &mut grace)
+            {
+                state.accept_best(&self.params, f64::NEG_INFINITY);
+            }
         }
         if state.num_rejections() >= FIRST_REJECTIONS {
             state.end_first_look();
         }
         if state.rounds_since_settling >= self.params.n_contest {
-            self.settle(state);
+            self.settle(state, &mut Grace::none(&state.problem.interrupt.clone()));
         }
         state.last_round()
     }
@@ -326,6 +351,8 @@ impl<'a> Registrar<'a> {
             None if round == 0 && self.scs.is_none() => par::join(select, || context.chance()).0,
             None => select(),
         };
+        // At the latest now, and not at the end, when there may be no time for it.
+        context.chance();
         let is_lean = state.rounds.last().is_some_and(|last| !last.accepted());
         if !is_lean || !self.selects_ahead(problem) || seeds.len() < self.params.t_s as usize {
             let play = || self.play_seeds(&context, tried, is_lean, seeds, timings);
@@ -336,7 +363,6 @@ impl<'a> Registrar<'a> {
                 None => play(),
             };
         }
-        context.chance(); // not from within the two threads
         let barred = problem.also_barred(seeds.ids());
         let (play, next) = par::join(
             || self.play_seeds(&context, tried, is_lean, seeds, timings),
@@ -348,8 +374,10 @@ impl<'a> Registrar<'a> {
 
     /// SCS, and how long it took.
     fn select(&self, context: &Context<'_>) -> (Ranked, Timings) {
-        context.interrupt.begin(Phase::Select);
         let mut timings = Timings::default();
+        if !context.interrupt.enter(Phase::Select) {
+            return (Ranked::default(), timings);
+        }
         let seeds = timed(&mut timings.scs_s, || self.scs().select_seeds(context));
         (seeds, timings)
     }
@@ -372,16 +400,19 @@ impl<'a> Registrar<'a> {
         seeds: Ranked,
         mut timings: Timings,
     ) -> Play {
-        if seeds.len() < self.params.t_s as usize || context.interrupt.is_set() {
+        if seeds.len() < self.params.t_s as usize || !context.interrupt.enter(Phase::Enhance) {
             return Play { seeds, timings, ..Play::default() };
         }
         let dense = timed(&mut timings.ce_s, || self.ce().enhance(context, &seeds));
-        context.interrupt.begin(Phase::Estimate);
+        if !context.interrupt.enter(Phase::Estimate) {
+            return Play { seeds, timings, ..Play::default() };
+        }
         let estimate = timed(&mut timings.te_s, || self.te().estimate_pose(context, &dense));
         let judged = estimate.hypothesis.map(|raw| {
             let before = self.known(context.scene, tried, &raw, None);
-            before.unwrap_or_else(|| self.judge(context, tried, is_lean, raw, &mut timings))
+            before.or_else(|| self.judge(context, tried, is_lean, raw, &mut timings))
         });
+        let judged = judged.flatten();
         Play { seeds, dense, estimate, judged, timings }
     }
 
@@ -407,7 +438,7 @@ impl<'a> Registrar<'a> {
 
     /// Polishes a hypothesis and validates it. Neither is done to the end where a rough polish, of one that has few inliers
     /// or where the scene is seen from one side, shows it to be known; or where a glance shows it to be hopeless, which is
-    /// not expected after a success.
+    /// not expected after a success. `None` once the run was interrupted.
     fn judge(
         &self,
         context: &Context<'_>,
@@ -415,47 +446,60 @@ impl<'a> Registrar<'a> {
         is_lean: bool,
         raw: Hypothesis,
         timings: &mut Timings,
-    ) -> Judged {
+    ) -> Option<Judged> {
         let Timings { refine_s, hv_s, .. } = timings;
         let scene = context.scene;
         let is_one_sided = scene.is_one_sided(context.params);
         let is_poor = raw.score < MANY_INLIERS || is_one_sided;
+        if self.params.refine != Refine::None && !context.interrupt.enter(Phase::Polish) {
+            return None;
+        }
         let polished = if is_poor { timed(refine_s, || context.polished(Detail::Glance, raw)) } else { None };
         let supported = polished.and_then(Polished::if_supported);
         let glanced = supported.unwrap_or(raw);
         // In a scan clouds fit almost anywhere: what has lost its correspondences there might as well be elsewhere.
         let rough = (supported.is_some() || !is_one_sided).then_some(glanced.target_from_source);
         if let Some(known) = self.known(scene, tried, &raw, rough.as_ref()) {
-            return known;
+            return Some(known);
         }
         let fitted = polished.filter(|_| !is_one_sided).map_or(glanced, |polished| polished.hypothesis);
         if is_lean && let Some(verdict) = timed(hv_s, || self.hv().glance(context, &fitted)) {
-            return Judged { hypothesis: glanced, verdict };
+            return Some(Judged { hypothesis: glanced, verdict });
         }
         let hypothesis = timed(refine_s, || context.refined(Detail::Look, glanced)).unwrap_or(raw);
+        if !context.interrupt.enter(Phase::Validate) {
+            return None;
+        }
         let verdict = timed(hv_s, || self.hv().validate(context, &hypothesis));
         // The clouds of a cluttered scene may draw a good pose away.
         let shift = scene.source.displacement(&raw.target_from_source, &hypothesis.target_from_source);
         if verdict.accepted() && shift > NEGLIGIBLE_PR * scene.resolution {
             let before = timed(hv_s, || self.hv().validate(context, &raw));
             if before.value > verdict.value {
-                return Judged { hypothesis: raw, verdict: before };
+                return Some(Judged { hypothesis: raw, verdict: before });
             }
         }
-        Judged { hypothesis, verdict }
+        Some(Judged { hypothesis, verdict })
     }
 
     /// Ends a contest: of the hypotheses that passed validation, the one with the best value becomes an
     /// instance and claims its scene points; the others are measured again on what is left, and so on. Those far
-    /// below the best stay for the next contest, in which a better pose of the same instance may turn up.
-    fn settle(&self, state: &mut State<'_>) -> u32 {
+    /// below the best stay for the next contest, in which a better pose of the same instance may turn up. So do all once
+    /// there is no time for it.
+    fn settle(&self, state: &mut State<'_>, grace: &mut Grace<'_>) -> u32 {
+        state.problem.interrupt.begin(Phase::Contest);
         let start = Instant::now();
         let mut best_value = None;
         let mut num_accepted = 0;
         while self.params.max_instances.is_none_or(|limit| state.num_found() < limit) {
-            state.measure_candidates(&self.params, self.hv());
+            let has_time = grace.allows(state.num_candidates() + 1);
+            if !has_time || !state.measure_candidates(&self.params, self.hv(), grace) {
+                break;
+            }
             let least = best_value.map_or(f64::NEG_INFINITY, |value: f64| CONTEST_MARGIN * value);
-            state.turn_best(&self.params, self.hv());
+            if !state.turn_best(&self.params, self.hv(), grace) {
+                break;
+            }
             let Some(value) = state.accept_best(&self.params, least) else { break };
             best_value = best_value.or(Some(value));
             num_accepted += 1;
@@ -465,19 +509,27 @@ impl<'a> Registrar<'a> {
         num_accepted
     }
 
-    /// Turns what a run has found into its result.
+    /// Turns what a run has found into its result: the contest is settled, the poses are checked and ranked.
+    ///
+    /// Of a run that was ended from outside, by now or in the course of this, a bounded part of that is still done, in the
+    /// order in which the poses were found, and enough for some hundred of them: a pose for which it does not suffice is left
+    /// out, as nothing can be said for it. If it is ended in the course of this, the stop reason is that.
     #[must_use]
     pub fn finish(&self, mut state: State<'_>, stop_reason: StopReason) -> Registration {
         let pool = Arc::clone(&state.pool);
         pool.install(|| {
-            while self.settle(&mut state) > 0 {}
+            let interrupt = state.problem.interrupt.clone();
+            let mut grace = Grace::new(&interrupt, finish::CONTEST, stop_reason.is_from_outside());
+            while self.settle(&mut state, &mut grace) > 0 {}
+            let mut grace = Grace::new(&interrupt, finish::CHECK, grace.is_over());
             let State { problem, found, .. } = &mut state;
             let supports = if self.params.joint_check {
-                joint_check(problem, &self.params, self.hv(), found)
+                joint_check(problem, &self.params, self.hv(), found, &mut grace)
             } else {
-                supports(problem, &self.params, found)
+                supports(problem, &self.params, found, &mut grace)
             };
-            state.into_registration(&self.params, stop_reason, &supports)
+            let mut grace = Grace::new(&interrupt, finish::RANK, grace.is_over());
+            state.into_registration(&self.params, stop_reason, &supports, &mut grace)
         })
     }
 

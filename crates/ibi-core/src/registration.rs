@@ -1,5 +1,7 @@
 //! What a run says about itself.
 
+use std::time::Instant;
+
 use nalgebra::Isometry3;
 
 use crate::stages::Verdict;
@@ -19,8 +21,28 @@ pub struct Registration {
     pub stop_reason: StopReason,
     /// Where the time went.
     pub timings: Timings,
-    /// pr, in data units.
+    /// pr, in data units; 0 where the run was ended before it was known.
     pub resolution: f64,
+}
+
+impl Registration {
+    /// The result of a run that was ended before its first round.
+    pub(crate) fn empty(
+        num_correspondences: usize,
+        stop_reason: StopReason,
+        start: Instant,
+        resolution: f64,
+    ) -> Self {
+        let total_s = start.elapsed().as_secs_f64();
+        Self {
+            poses: Vec::new(),
+            labels: vec![None; num_correspondences],
+            rounds: Vec::new(),
+            stop_reason,
+            timings: Timings { prepare_s: total_s, total_s, ..Timings::default() },
+            resolution,
+        }
+    }
 }
 
 /// One instance.
@@ -144,6 +166,11 @@ pub enum StopReason {
 }
 
 impl StopReason {
+    /// Whether the run was ended from outside.
+    pub(crate) fn is_from_outside(&self) -> bool {
+        matches!(self, Self::Timeout { .. } | Self::Cancelled)
+    }
+
     /// Whether the rounds ran dry, rather than being ended by a limit or from outside.
     pub(crate) fn is_dry(&self) -> bool {
         matches!(

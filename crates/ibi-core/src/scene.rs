@@ -82,9 +82,12 @@ impl<'a> Clouds<'a> {
     }
 
     /// What lies near in each of them.
-    pub(crate) fn near(&self, params: &Params) -> [Nearby; 2] {
-        let reach = (2.0 * params.d_op_pr).max(params.t_he_pr) * self.resolution;
-        [&self.source.points, &self.target.points].map(|points| Nearby::new(points, reach))
+    pub(crate) fn near(&self, params: &Params, interrupt: &Interrupt) -> Result<[Nearby; 2], Error> {
+        let usual = 2.0 * params.d_op_pr * self.resolution;
+        let reach = usual.max(params.t_he_pr * self.resolution);
+        let near = |points| Nearby::until(points, reach, usual, || interrupt.is_set());
+        let near = near(&self.source.points).zip(near(&self.target.points));
+        near.map(|(source, target)| [source, target]).ok_or_else(|| interrupt.error())
     }
 }
 
@@ -94,18 +97,22 @@ impl<'a> Scene<'a> {
         [near_source, near_target]: [Nearby; 2],
         measured: Option<&[Point3<f64>]>,
         params: &Params,
-    ) -> Self {
+        interrupt: &Interrupt,
+    ) -> Result<Self, Error> {
+        interrupt.proceed()?;
         let Clouds { source, target, resolution } = clouds;
         let mut scene = Self { source, target, resolution, near_source, near_target, measured: None };
         if scene.is_one_sided(params)
             && let Some(eye) = scene.target.viewpoint
         {
             // Now, not first from within a parallel map: both are one themselves.
-            scene.source.shade(&Interrupt::never());
+            scene.source.shade(interrupt);
+            interrupt.proceed()?;
             let points = measured.unwrap_or(&scene.target.points);
             scene.measured = RangeImage::new(eye, points, PIXEL_PR * resolution);
         }
-        scene
+        interrupt.proceed()?;
+        Ok(scene)
     }
 }
 

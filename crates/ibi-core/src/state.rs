@@ -7,15 +7,17 @@ use std::time::Instant;
 use nalgebra::Isometry3;
 
 use crate::claims::Claims;
+use crate::cloud::PROBE_POINTS;
 use crate::correspondence::{Alive, PointPairs};
-use crate::interrupt::Interrupt;
+use crate::finish::Grace;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
-use crate::kernels::par::{self, Pool};
+use crate::kernels::par::Pool;
 use crate::params::{Params, Refine, Removal};
 use crate::registration::{Pose, Registration, Round, StopReason, Timings};
 use crate::scene::{Detail, Scene};
-use crate::stages::{Chance, Context, Estimate, Hypothesis, Ranked, Validate, Verdict};
+use crate::stages::{Chance, Context, Estimate, Hypothesis, LOOK_NEAR, Ranked, Validate, Verdict};
 
 /// Fewest correspondences that fix a pose.
 const MIN_CORRESPONDENCES: u32 = 3;
@@ -153,6 +155,20 @@ impl<'a> Problem<'a> {
         (a * source.centre - b * source.centre).norm() < source.extent + reach
     }
 
+    /// About how many points are looked at for a close look at a pose.
+    pub(crate) fn cost_of_look(&self, params: &Params) -> usize {
+        let num_source = self.scene.source.points.len();
+        let num_looked_at =
+            if self.scene.is_one_sided(params) { num_source } else { num_source.min(PROBE_POINTS) };
+        num_looked_at + LOOK_NEAR + self.pairs.len() / 16
+    }
+
+    /// The same for a verdict.
+    pub(crate) fn cost_of(&self, params: &Params, hv: &dyn Validate) -> usize {
+        let is_by_look = hv.verdict_of(&Support::default()).is_some();
+        self.cost_of_look(params) + if is_by_look { 0 } else { self.scene.source.points.len() }
+    }
+
     /// Takes `ids` out of what is alive; returns how many of them were.
     fn remove(&mut self, ids: &[u32]) -> u32 {
         if let Some(graph) = self.graph.get_mut() {
@@ -277,6 +293,11 @@ impl<'a> State<'a> {
         self.problem.interrupt.check()
     }
 
+    /// Hypotheses that wait for the end of the contest.
+    pub(crate) fn num_candidates(&self) -> usize {
+        self.candidates.len()
+    }
+
     pub(crate) fn num_found(&self) -> u32 {
         self.found.len() as u32
     }
@@ -354,14 +375,25 @@ impl<'a> State<'a> {
     }
 
     /// Validates again the candidates near which an instance has claimed points since they were measured; drops
-    /// those that fail.
-    pub(crate) fn measure_candidates(&mut self, params: &Params, hv: &dyn Validate) {
+    /// those that fail. Whether there was time for all of them.
+    pub(crate) fn measure_candidates(
+        &mut self,
+        params: &Params,
+        hv: &dyn Validate,
+        grace: &mut Grace<'_>,
+    ) -> bool {
         let now = self.num_found();
+        let cost = self.problem.cost_of(params, hv);
+        let mut is_complete = true;
         let mut candidates = std::mem::take(&mut self.candidates);
         candidates.retain_mut(|candidate| {
             let since = &self.found[candidate.measured_at as usize..];
             let pose = &candidate.hypothesis.target_from_source;
             if since.iter().any(|found| self.problem.are_near(params, pose, found.pose())) {
+                is_complete = is_complete && grace.allows(cost);
+                if !is_complete {
+                    return true;
+                }
                 let context = self.problem.context(params, candidate.round as usize, &self.found);
                 let verdict = hv.validate(&context, &candidate.hypothesis);
                 (candidate.value, candidate.measured_at) = (verdict.value, now);
@@ -370,6 +402,7 @@ impl<'a> State<'a> {
             true
         });
         self.candidates = candidates;
+        is_complete
     }
 
     /// The row of the best candidate; of equals that of the earliest round.
@@ -378,24 +411,33 @@ impl<'a> State<'a> {
         self.candidates.iter().enumerate().max_by(|(_, a), (_, b)| order(a, b)).map(|(at, _)| at)
     }
 
-    /// Turns the best candidate about if it fits better that way ([`Refine::IcpTurns`]).
-    pub(crate) fn turn_best(&mut self, params: &Params, hv: &dyn Validate) {
+    /// Turns the best candidate about if it fits better that way ([`Refine::IcpTurns`]). Whether there was time for it.
+    pub(crate) fn turn_best(&mut self, params: &Params, hv: &dyn Validate, grace: &mut Grace<'_>) -> bool {
         let scene = &self.problem.scene;
         if params.refine != Refine::IcpTurns || !scene.is_one_sided(params) {
-            return;
+            return true;
         }
-        let Some(at) = self.best() else { return };
+        let Some(at) = self.best() else { return true };
         let Candidate { hypothesis, value, round, .. } = self.candidates[at];
         let context = self.problem.context(params, round as usize, &self.found);
         let turns = scene.source.turns();
-        let mut glances = par::map(turns.len(), 1, |i| {
-            let pose = scene.icp(params, Detail::Glance, &(hypothesis.target_from_source * turns[i]));
-            let claims = context.claims.near(&pose);
-            (scene.fit(params, Detail::Glance, &pose, |rows| claims.contain(rows)).share, pose)
-        });
+        let cost = self.problem.cost_of_look(params);
+        let glances = grace.map(
+            turns.len(),
+            |_| 2 * cost,
+            |i| {
+                let pose = scene.icp(params, Detail::Glance, &(hypothesis.target_from_source * turns[i]));
+                let claims = context.claims.near(&pose);
+                (scene.fit(params, Detail::Glance, &pose, |rows| claims.contain(rows)).share, pose)
+            },
+        );
+        let Some(mut glances) = glances.into_iter().collect::<Option<Vec<_>>>() else { return false };
         glances.sort_by(|(a, _), (b, _)| b.total_cmp(a));
         let mut best = (value, hypothesis);
         for (_, pose) in &glances[..NUM_TURNS] {
+            if !grace.allows(8 * cost) {
+                return false;
+            }
             let target_from_source = scene.icp(params, Detail::Look, pose);
             let turned = Hypothesis { target_from_source, ..hypothesis };
             let verdict = hv.validate(&context, &turned);
@@ -405,6 +447,7 @@ impl<'a> State<'a> {
         }
         let candidate = &mut self.candidates[at];
         (candidate.value, candidate.hypothesis) = best;
+        true
     }
 
     /// Makes an instance of the best candidate, the earlier of equals, if its value is at least `least`; returns
@@ -430,21 +473,36 @@ impl<'a> State<'a> {
         Some(value)
     }
 
-    /// The result: poses measured and ranked, correspondences labelled. `supports` tells what speaks for each instance.
+    /// The result: poses measured and ranked, correspondences labelled. `supports` tells what speaks for each instance. Those
+    /// for which there is no time are left out.
     pub(crate) fn into_registration(
         mut self,
         params: &Params,
         stop_reason: StopReason,
         supports: &[Support],
+        grace: &mut Grace<'_>,
     ) -> Registration {
-        let mut measured: Vec<(Pose, Vec<f64>)> = par::map(self.found.len(), 1, |at| {
-            measure(&self.problem, params, &self.found[at], &supports[at])
-        });
+        self.problem.interrupt.begin(Phase::Rank);
+        let cost = |at: usize| {
+            let overlap = if self.found[at].overlap.get().is_some() {
+                0
+            } else {
+                self.problem.scene.source.points.len()
+            };
+            overlap + self.problem.pairs.len() / 16 + 1
+        };
+        let measured = grace
+            .map(self.found.len(), cost, |at| measure(&self.problem, params, &self.found[at], &supports[at]));
+        let mut measured: Vec<(Pose, Vec<f64>)> = measured.into_iter().flatten().collect();
         // Stable: equals stay in the order in which they were found.
         measured.sort_by(|(a, _), (b, _)| b.score.total_cmp(&a.score));
-        drop_duplicates(&self.problem.scene, &mut measured);
+        drop_duplicates(&self.problem.scene, &mut measured, grace);
         let labels = labels(&measured, self.problem.pairs.len());
         self.timings.total_s = self.start.elapsed().as_secs_f64();
+        let stop_reason = match self.problem.interrupt.check() {
+            ControlFlow::Break(reason) if !stop_reason.is_from_outside() => reason,
+            _ => stop_reason,
+        };
         Registration {
             poses: measured.into_iter().map(|(pose, _)| pose).collect(),
             labels,
@@ -485,13 +543,16 @@ fn measure(problem: &Problem<'_>, params: &Params, found: &Found, support: &Supp
 }
 
 /// Drops what differs from a better pose by a declared symmetry alone; nothing where none is declared.
-fn drop_duplicates(scene: &Scene<'_>, measured: &mut Vec<(Pose, Vec<f64>)>) {
+///
+/// Once the run is ended and the time for this is over, the poses of the least scores go, whether they are duplicates or not.
+fn drop_duplicates(scene: &Scene<'_>, measured: &mut Vec<(Pose, Vec<f64>)>, grace: &mut Grace<'_>) {
     if scene.source.symmetries.is_none() {
         return;
     }
     let mut kept: Vec<Isometry3<f64>> = Vec::new();
     measured.retain(|(Pose { target_from_source: pose, .. }, _)| {
-        let is_new = kept.iter().all(|other| !scene.source.look_the_same(pose, other));
+        let is_new =
+            grace.allows(kept.len()) && kept.iter().all(|other| !scene.source.look_the_same(pose, other));
         if is_new {
             kept.push(*pose);
         }

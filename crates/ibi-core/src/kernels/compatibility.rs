@@ -55,11 +55,24 @@ pub fn payoff_matrix(
 /// O(candidates x voters).
 #[must_use]
 pub fn votes(candidates: &Columns, voters: &Columns, delta_r: f64) -> Vec<f32> {
+    votes_until(candidates, voters, delta_r, || false)
+}
+
+/// [`votes`] that asks `interrupted` from time to time; then they are too few.
+pub(crate) fn votes_until(
+    candidates: &Columns,
+    voters: &Columns,
+    delta_r: f64,
+    interrupted: impl Fn() -> bool + Sync + Send,
+) -> Vec<f32> {
     let inv = 1.0 / delta_r as f32;
     let grain = VOTE_GRAIN.max(VOTES_PER_THREAD / voters.len().max(1));
     let chunks = par::chunks(candidates.len(), grain, |run| {
         let (mut votes, mut of_one) = (vec![0.0; run.len()], vec![0.0; run.len()]);
         for j in 0..voters.len() {
+            if j % VOTERS_AT_A_TIME == 0 && interrupted() {
+                break;
+            }
             let (p, q) = voters.pair(j);
             candidates.map_run_into(run.clone(), &mut of_one, |pi, qi| {
                 gaussian(distance(p, pi), distance(q, qi), inv)
@@ -81,6 +94,9 @@ pub(crate) fn vote_reach(delta_r: f64) -> f32 {
 
 /// Candidates that one thread takes at a time at least: more fit into no innermost cache.
 const VOTE_GRAIN: usize = 1024;
+
+/// Voters that have their say before the clock is looked at: about a millisecond of work.
+const VOTERS_AT_A_TIME: usize = 512;
 
 /// Votes that are worth a thread.
 const VOTES_PER_THREAD: usize = 1 << 16;

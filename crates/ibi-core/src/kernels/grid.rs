@@ -15,8 +15,10 @@ pub struct Grid {
     shape: [usize; 3],
     /// The last cell of each axis.
     last: [f32; 3],
-    /// Start of each cell in `order`, plus the end.
+    /// Start of each cell in `order`, plus the end; of a sparse grid of each cell of `occupied`.
     starts: Vec<u32>,
+    /// Of a sparse grid the cells that hold points, ascending; else nothing.
+    occupied: Vec<usize>,
     order: Vec<u32>,
 }
 
@@ -24,6 +26,14 @@ pub struct Grid {
 /// a column stand together anyhow and a few more cost nothing, then on all axes.
 const MIN_CELLS: usize = 1 << 12;
 const CELLS_PER_POINT: usize = 4;
+
+/// Where that has made the cells more than so much wider and a point shares its cell with more than so many others, on
+/// average, only the cells that hold points are kept, and searched for: clusters that lie far apart.
+const MOST_WIDENED: f32 = 2.0;
+const MOST_SHARED: usize = 1024;
+
+/// Cells per axis of a sparse grid at most: then a number of 64 bits names each.
+const MAX_PER_SPARSE_AXIS: usize = 1 << 21;
 
 /// Least width of a cell: a place far from the points is still a finite number of cells away.
 const MIN_CELL: f32 = 1e-15;
@@ -44,7 +54,7 @@ impl Grid {
     /// on the rim, so that one stray point a kilometre away does not make all others share a cell.
     ///
     /// # Complexity
-    /// O(n) time; 4 bytes a point and at most 16 a point (or 16 KiB) for the cells.
+    /// O(n) time, O(n log n) for clusters that lie far apart; 4 bytes a point and at most 16 a point (or 16 KiB) for the cells.
     #[must_use]
     pub fn new(points: &[Vec<f32>; 3], cell: f32) -> Self {
         Self::in_box(points, points.each_ref().map(|axis| bulk(axis)), cell)
@@ -52,6 +62,32 @@ impl Grid {
 
     /// The same where the [`bulk`] of each axis is known.
     pub(crate) fn in_box(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
+        let grid = Self::dense(points, bounds, cell);
+        let widened = cell * grid.inv_cell.iter().fold(f32::INFINITY, |least, &inv| least.min(inv));
+        if widened * MOST_WIDENED < 1.0 && grid.sharing() > MOST_SHARED {
+            Self::sparse(points, bounds, cell)
+        } else {
+            grid
+        }
+    }
+
+    /// With how many others a point shares its cell, on average.
+    pub(crate) fn sharing(&self) -> usize {
+        let lens = self.starts.windows(2).map(|run| (run[1] - run[0]) as usize);
+        lens.map(|len| len * len).sum::<usize>() / self.order.len().max(1)
+    }
+
+    /// How far a place is from the box that holds the bulk of the points.
+    pub(crate) fn distance_to_box(&self, place: [f32; 3]) -> f32 {
+        let gaps = [0, 1, 2].map(|axis| {
+            let width = self.shape[axis] as f32 / self.inv_cell[axis];
+            (self.low[axis] - place[axis]).max(place[axis] - self.low[axis] - width).max(0.0)
+        });
+        gaps.iter().map(|gap| gap * gap).sum::<f32>().sqrt()
+    }
+
+    /// A grid that knows where each cell begins.
+    fn dense(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
         let n = points[0].len();
         let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
         let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
@@ -70,6 +106,7 @@ impl Grid {
             shape: [shape[0], shape[1], num(2, cell_z).min(height)],
             last: [0.0; 3],
             starts: Vec::new(),
+            occupied: Vec::new(),
             order: Vec::new(),
         };
         grid.last = grid.shape.map(|num| (num - 1) as f32);
@@ -89,6 +126,54 @@ impl Grid {
         grid
     }
 
+    /// A grid that knows of no cell but those that hold points. They are as wide as can be wished, or nearly so.
+    fn sparse(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
+        let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
+        let cell = cell.max(widest / (MAX_PER_SPARSE_AXIS - 1) as f32 * 1.0001).max(MIN_CELL);
+        let shape =
+            bounds.map(|(low, high)| (((high - low) / cell) as usize + 1).clamp(2, MAX_PER_SPARSE_AXIS));
+        let mut grid = Self {
+            low: bounds.map(|(low, _)| low),
+            inv_cell: [1.0 / cell; 3],
+            shape,
+            last: shape.map(|num| (num - 1) as f32),
+            starts: Vec::new(),
+            occupied: Vec::new(),
+            order: Vec::new(),
+        };
+        let [x, y, z] = points;
+        let mut sorted: Vec<(usize, u32)> =
+            (0..x.len()).map(|i| (grid.index(grid.cell([x[i], y[i], z[i]])), i as u32)).collect();
+        sorted.sort_unstable();
+        for (at, &(cell, _)) in (0..).zip(&sorted) {
+            if grid.occupied.last() != Some(&cell) {
+                grid.occupied.push(cell);
+                grid.starts.push(at);
+            }
+        }
+        grid.starts.push(sorted.len() as u32);
+        grid.order = sorted.into_iter().map(|(_, i)| i).collect();
+        grid
+    }
+
+    /// Where a cell begins in the order, or would.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // in the head of inner loops
+    fn start(&self, cell: usize) -> usize {
+        if self.occupied.is_empty() { self.starts[cell] as usize } else { self.sparse_start(cell) }
+    }
+
+    #[cold]
+    fn sparse_start(&self, cell: usize) -> usize {
+        self.starts[self.occupied.partition_point(|&other| other < cell)] as usize
+    }
+
+    /// Whether so many columns are more than are worth looking at one by one.
+    fn are_too_many(&self, low: [usize; 3], high: [usize; 3]) -> bool {
+        let columns = (high[0] - low[0] + 1).saturating_mul(high[1] - low[1] + 1);
+        !self.occupied.is_empty() && columns > self.occupied.len()
+    }
+
     /// The points, by cell; within a cell in their own order.
     #[must_use]
     pub fn order(&self) -> &[u32] {
@@ -104,10 +189,13 @@ impl Grid {
     /// Ranges of [`Self::order`], ascending, that hold every point within `radius` of `place`, and others.
     pub fn around(&self, place: [f32; 3], radius: f32) -> impl Iterator<Item = Range<usize>> + '_ {
         let (radius, low, high) = self.ball(place, radius);
-        (low[0]..=high[0]).flat_map(move |x| {
+        let all = self.are_too_many(low, high).then_some(0..self.order.len());
+        let columns = if all.is_some() { 0..0 } else { low[0]..high[0] + 1 };
+        let columns = columns.flat_map(move |x| {
             let dx = self.gap(0, x, place[0]);
             (low[1]..=high[1]).filter_map(move |y| self.column([x, y], dx, place, radius))
-        })
+        });
+        all.into_iter().chain(columns)
     }
 
     /// Hands the ranges of [`Self::around`] to `look`. A loop and no iterator, where many ask for many.
@@ -115,6 +203,9 @@ impl Grid {
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn each_around(&self, place: [f32; 3], radius: f32, mut look: impl FnMut(Range<usize>)) {
         let (radius, low, high) = self.ball(place, radius);
+        if self.are_too_many(low, high) {
+            return look(0..self.order.len());
+        }
         for x in low[0]..=high[0] {
             let dx = self.gap(0, x, place[0]);
             for y in low[1]..=high[1] {
@@ -143,19 +234,19 @@ impl Grid {
         }
         let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
         let (first, last) = (self.along(2, place[2] - reach), self.along(2, place[2] + reach));
-        Some(self.starts[row + first] as usize..self.starts[row + last + 1] as usize)
+        Some(self.start(row + first)..self.start(row + last + 1))
     }
 
     /// For each cell that holds points: its range of [`Self::order`], and, ascending, those that hold every point within
     /// `radius` of any of its points, and others. Cells follow each other in the order.
     pub fn neighborhoods(&self, radius: f32) -> impl Iterator<Item = (Range<usize>, Vec<Range<usize>>)> + '_ {
-        let [nx, ny, nz] = self.shape;
-        let cells = (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])));
+        let [_, ny, nz] = self.shape;
         // A little more, for rounding.
         let radius = radius * 1.001;
-        cells.filter_map(move |cell| {
-            let index = self.index(cell);
-            let home = self.starts[index] as usize..self.starts[index + 1] as usize;
+        (0..self.starts.len() - 1).filter_map(move |at| {
+            let home = self.starts[at] as usize..self.starts[at + 1] as usize;
+            let index = self.occupied.get(at).copied().unwrap_or(at);
+            let cell = [index / nz / ny, index / nz % ny, index % nz];
             (!home.is_empty()).then(|| (home, self.around_cell(cell, radius)))
         })
     }
@@ -167,6 +258,11 @@ impl Grid {
         let window = |c: usize, axis: usize| c.saturating_sub(most)..=(c + most).min(self.shape[axis] - 1);
         // Between two cells lie all those that separate them.
         let gap = |a: usize, b: usize| a.abs_diff(b).saturating_sub(1) as f32;
+        let [low, high_of] =
+            [0, 1].map(|end| [x, y, z].map(|c| if end == 0 { c.saturating_sub(most) } else { c + most }));
+        if self.are_too_many(low, high_of) {
+            return std::iter::once(0..self.order.len()).collect();
+        }
         let mut runs = Vec::with_capacity(window(x, 0).count() * window(y, 1).count());
         for other_x in window(x, 0) {
             for other_y in window(y, 1) {
@@ -177,7 +273,7 @@ impl Grid {
                 let reach = (left.sqrt() / wide * high) as usize + 1;
                 let row = self.index([other_x, other_y, 0]);
                 let (first, last) = (z.saturating_sub(reach), (z + reach).min(self.shape[2] - 1));
-                let run = self.starts[row + first] as usize..self.starts[row + last + 1] as usize;
+                let run = self.start(row + first)..self.start(row + last + 1);
                 if !run.is_empty() {
                     runs.push(run);
                 }
@@ -197,7 +293,7 @@ impl Grid {
         };
         let corner = self.index([first(0), first(1), first(2)]);
         let (next_x, next_y) = (self.shape[1] * self.shape[2], self.shape[2]);
-        let run = |at: usize| self.starts[at] as usize..self.starts[at + 2] as usize;
+        let run = |at: usize| self.start(at)..self.start(at + 2);
         [run(corner), run(corner + next_y), run(corner + next_x), run(corner + next_x + next_y)]
     }
 
@@ -212,7 +308,7 @@ impl Grid {
         for x in x.saturating_sub(1)..end(0, x) {
             for y in y.saturating_sub(1)..end(1, y) {
                 let row = self.index([x, y, 0]);
-                look(self.starts[row + first] as usize..self.starts[row + last] as usize);
+                look(self.start(row + first)..self.start(row + last));
             }
         }
     }

@@ -8,7 +8,7 @@ use std::ops::Range;
 
 use nalgebra::{Point3, Vector3};
 
-use super::columns::{columns, middle};
+use super::columns::{columns, middle, min_max};
 use super::grid::{Grid, bulk};
 use super::par;
 use super::rng::Rng;
@@ -25,10 +25,26 @@ const LANES: usize = 16;
 #[derive(Debug)]
 pub struct Nearby {
     sorted: Sorted,
+    /// With the points that coincide with another one, where there are so many that the first leaves them out.
+    all: Option<Sorted>,
+    /// Whether the cells are narrower than the reach, as too many points lie within it.
+    is_fine: bool,
     middle: Vector3<f64>,
     reach: f64,
     inv_reach: f64,
 }
+
+/// Where a point shares its cell with more than so many others, on average, cells are narrower than the reach, so that one in
+/// the end shares it with no more than the second number. Within the usual reach lie some tens, or a thousand at
+/// the ten times as wide reach of the paper's presets.
+const MOST_SHARED: usize = 1 << 13;
+const SHARED: usize = 64;
+
+/// Cells are not narrower than this part of the cloud: `f32` tells no more places apart.
+const LEAST_PART: f32 = 1e-6;
+
+/// Points near a query that a sum is taken over, at most: of more every so many-th stands for all.
+const MOST_SUMMED: usize = 1 << 14;
 
 /// No point.
 const NONE: u32 = u32::MAX;
@@ -40,10 +56,84 @@ impl Nearby {
     /// O(n) time; 16 bytes a point and at most 16 a point for the cells.
     #[must_use]
     pub fn new(points: &[Point3<f64>], reach: f64) -> Self {
-        let middle = middle(points);
-        let rows = columns(points, middle, reach);
-        // The reach is 1. A cell and its neighbours hold it, and the blocks of two cells an axis half of it for sure.
-        Self { sorted: Sorted::new(&rows, Grid::new(&rows, 1.005)), middle, reach, inv_reach: 1.0 / reach }
+        Self::with_usual(points, reach, reach)
+    }
+
+    /// The same where most questions are within `usual`, which is no more than the reach.
+    #[must_use]
+    pub fn with_usual(points: &[Point3<f64>], reach: f64, usual: f64) -> Self {
+        let (grid, rows, bounds) = Self::sort(points, reach, usual);
+        let sorted = Sorted::new(&rows, grid);
+        Self::of(points, [reach, usual], sorted, &rows, bounds)
+    }
+
+    /// The same; `None` once `interrupted` says so.
+    pub(crate) fn until(
+        points: &[Point3<f64>],
+        reach: f64,
+        usual: f64,
+        interrupted: impl Fn() -> bool,
+    ) -> Option<Self> {
+        if interrupted() {
+            return None;
+        }
+        let (grid, rows, bounds) = Self::sort(points, reach, usual);
+        if interrupted() {
+            return None;
+        }
+        let sorted = Sorted::new(&rows, grid);
+        (!interrupted()).then(|| Self::of(points, [reach, usual], sorted, &rows, bounds))
+    }
+
+    /// The grid over some points, their columns, and the box around their bulk.
+    fn sort(points: &[Point3<f64>], reach: f64, usual: f64) -> (Grid, [Vec<f32>; 3], [(f32, f32); 3]) {
+        let rows = columns(points, middle(points), reach);
+        let bounds = rows.each_ref().map(|axis| bulk(axis));
+        // The reach is 1. A cell and its neighbours hold what is usual, and the blocks of two cells an axis half of it for
+        // sure.
+        (Grid::in_box(&rows, bounds, cell_of(reach, usual)), rows, bounds)
+    }
+
+    fn of(
+        points: &[Point3<f64>],
+        [reach, usual]: [f64; 2],
+        sorted: Sorted,
+        rows: &[Vec<f32>; 3],
+        bounds: [(f32, f32); 3],
+    ) -> Self {
+        let mut nearby = Self {
+            sorted,
+            all: None,
+            is_fine: usual < reach,
+            middle: middle(points),
+            reach,
+            inv_reach: 1.0 / reach,
+        };
+        let mut sharing = nearby.sorted.grid.sharing();
+        if sharing > MOST_SHARED {
+            let (distinct, kept) = distinct(rows);
+            nearby.is_fine = true;
+            let widest = bounds.iter().map(|(low, high)| high - low).fold(f32::MIN_POSITIVE, f32::max);
+            let mut cell = cell_of(reach, usual).min(widest);
+            let mut grid = None;
+            while sharing > SHARED && cell > LEAST_PART * widest {
+                // They may fill a volume or a surface, or lie in clusters: not too narrow at once.
+                cell *= (SHARED as f32 / sharing as f32).cbrt().clamp(0.25, 0.8);
+                let finer = Grid::in_box(&distinct, bounds, cell);
+                sharing = finer.sharing();
+                grid = Some(finer);
+            }
+            if let Some(grid) = grid {
+                let all = std::mem::replace(&mut nearby.sorted, Sorted::of(&distinct, grid, &kept));
+                nearby.all = (kept.len() < points.len()).then_some(all);
+            }
+        }
+        nearby
+    }
+
+    /// With the points that coincide.
+    fn all(&self) -> &Sorted {
+        self.all.as_ref().unwrap_or(&self.sorted)
     }
 
     /// The reach, in the unit of the points.
@@ -76,7 +166,7 @@ impl Nearby {
     /// the reach.
     pub fn within(&self, query: &Point3<f64>, distance: f64) -> impl Iterator<Item = u32> + '_ {
         let (q, radius) = (self.local(query), self.radius(distance));
-        let Sorted { grid, points, .. } = &self.sorted;
+        let Sorted { grid, points, .. } = self.all();
         let [x, y, z] = points.each_ref().map(Vec::as_slice);
         grid.around(q, radius).flatten().filter_map(move |at| {
             let d = [x[at] - q[0], y[at] - q[1], z[at] - q[2]];
@@ -84,22 +174,48 @@ impl Nearby {
         })
     }
 
-    /// For each of `queries` the sum of the `values`, one for each row, of [`Self::within`].
+    /// For each of `queries` the sum of the `values`, one for each row, of [`Self::within`]; where that are more than
+    /// 16,384 points or so, about the sum.
     #[must_use]
     pub fn sums_within(&self, distance: f64, queries: &[Point3<f64>], values: &[u32]) -> Vec<u32> {
+        self.sums_within_until(distance, queries, values, || false)
+    }
+
+    /// [`Self::sums_within`] that asks `interrupted` from time to time; then sums may be 0.
+    pub(crate) fn sums_within_until(
+        &self,
+        distance: f64,
+        queries: &[Point3<f64>],
+        values: &[u32],
+        interrupted: impl Fn() -> bool + Sync + Send,
+    ) -> Vec<u32> {
         /// Queries that one thread takes at a time.
         const GRAIN: usize = 512;
         let radius = self.radius(distance);
-        let Sorted { grid, points, .. } = &self.sorted;
+        let Sorted { grid, points, .. } = self.all();
+        let total: u32 = values.iter().sum();
+        let is_crowded = self.may_hold(radius, MOST_SUMMED);
+        let bounds = points.each_ref().map(|axis| min_max(&axis[..grid.order().len()]));
         let values: Vec<u32> = grid.order().iter().map(|&row| values[row as usize]).collect();
         let chunks = par::chunks(queries.len(), GRAIN, |run| {
             let mut sums = vec![0; run.len()];
+            if interrupted() {
+                return sums;
+            }
             let (sums_mut, queries) = (&mut sums[..], &queries[run]);
             simd(
                 #[inline(always)]
                 || {
                     for (sum, query) in sums_mut.iter_mut().zip(queries) {
                         let q = self.local(query);
+                        if is_crowded && self.crowding(q, radius) > MOST_SUMMED {
+                            if interrupted() {
+                                break;
+                            }
+                            let has_all = farthest(q, &bounds) < 0.999 * radius;
+                            *sum = if has_all { total } else { self.sum_of_some(q, radius, &values) };
+                            continue;
+                        }
                         grid.each_around(
                             q,
                             radius,
@@ -116,6 +232,44 @@ impl Nearby {
             sums
         });
         chunks.concat()
+    }
+
+    /// Whether more than so many points may lie in the cells around a place.
+    fn may_hold(&self, radius: f32, most: usize) -> bool {
+        let grid = &self.all().grid;
+        let cells = (2.0 * radius / grid.cell_size() + 2.0).powi(3);
+        cells * grid.sharing() as f32 > most as f32
+    }
+
+    /// Whether so many points may lie within `distance` of one that not all of them should be looked at for each.
+    pub(crate) fn is_crowded(&self, distance: f64) -> bool {
+        self.may_hold(self.radius(distance), MOST_SUMMED)
+    }
+
+    /// How many points the cells around a query hold.
+    #[cold]
+    fn crowding(&self, place: [f32; 3], radius: f32) -> usize {
+        let mut num = 0;
+        self.all().grid.each_around(place, radius, |run| num += run.len());
+        num
+    }
+
+    /// Of the points around a place every so many-th, each for so many.
+    fn sum_of_some(&self, place: [f32; 3], radius: f32, values: &[u32]) -> u32 {
+        let Sorted { grid, points, .. } = self.all();
+        let step = self.crowding(place, radius).div_ceil(MOST_SUMMED).max(1);
+        let (mut sum, mut skip) = (0_u32, 0);
+        grid.each_around(place, radius, |run| {
+            let mut at = run.start + skip;
+            while at < run.end {
+                let d = [0, 1, 2].map(|axis| points[axis][at] - place[axis]);
+                let is_within = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius * radius;
+                sum = sum.saturating_add(if is_within { values[at] } else { 0 });
+                at += step;
+            }
+            skip = at - run.end;
+        });
+        sum.saturating_mul(step as u32)
     }
 
     /// A distance in the unit of the columns, and a little more, for rounding.
@@ -155,8 +309,53 @@ impl Nearby {
             #[inline(always)]
             |run| search.look::<false>(run, NONE),
         );
+        if self.is_fine {
+            let sure = 2.0 * columns.seen;
+            if sure < bound {
+                return search.row_within(sure).or_else(|| self.far_row(search, q, bound));
+            }
+        }
         search.row_within(f32::INFINITY)
     }
+
+    /// What [`Self::row`] finds farther away than a cell is wide.
+    #[cold]
+    fn far_row<S: Simd>(&self, mut search: Search<'_, S>, q: [f32; 3], bound: f32) -> Option<u32> {
+        let mut radius = self.sorted.first_radius(q);
+        loop {
+            for run in self.sorted.grid.around(q, radius.min(bound)) {
+                search.look::<false>(run, NONE);
+            }
+            if let Some(row) = search.row_within(if radius >= bound { f32::INFINITY } else { radius }) {
+                return Some(row);
+            }
+            if radius >= bound {
+                return None;
+            }
+            radius *= 2.0;
+        }
+    }
+}
+
+/// How wide cells are, in reaches.
+fn cell_of(reach: f64, usual: f64) -> f32 {
+    1.005 * (usual / reach) as f32
+}
+
+/// The distance from a place to the farthest corner of a box.
+fn farthest(place: [f32; 3], bounds: &[(f32, f32); 3]) -> f32 {
+    let far = [0, 1, 2].map(|axis| (place[axis] - bounds[axis].0).max(bounds[axis].1 - place[axis]));
+    far.iter().map(|far| far * far).sum::<f32>().sqrt()
+}
+
+/// The columns without the points that coincide with one before them, and the rows of those that are left.
+fn distinct(rows: &[Vec<f32>; 3]) -> ([Vec<f32>; 3], Vec<u32>) {
+    let key = |row: u32| rows.each_ref().map(|axis| axis[row as usize].to_bits());
+    let mut sorted: Vec<u32> = (0..rows[0].len() as u32).collect();
+    sorted.sort_unstable_by_key(|&row| (key(row), row));
+    sorted.dedup_by_key(|row| key(*row));
+    sorted.sort_unstable();
+    (rows.each_ref().map(|axis| sorted.iter().map(|&row| axis[row as usize]).collect()), sorted)
 }
 
 /// The loop of [`Nearby::any_within_each`].
@@ -188,6 +387,10 @@ impl WithSimd for AnyWithinEach<'_> {
                     #[inline(always)]
                     |run| search.look::<false>(run, NONE),
                 );
+                if nearby.is_fine && 2.0 * columns.seen < bound && !search.has_found(bound) {
+                    any.push(nearby.far_row(search, q, bound).is_some());
+                    continue;
+                }
             }
             any.push(search.has_found(bound));
         }
@@ -246,7 +449,12 @@ impl WithSimd for NearestEach<'_> {
 /// As [`mean_spacing`]; with twins twice that, and O(n) memory.
 #[must_use]
 pub fn spacing(points: &[Point3<f64>]) -> f64 {
-    let (all, size) = nearest_distances(points);
+    spacing_until(points, || false).unwrap_or_default()
+}
+
+/// [`spacing`]; `None` once `interrupted` says so.
+pub(crate) fn spacing_until(points: &[Point3<f64>], interrupted: impl Fn() -> bool) -> Option<f64> {
+    let (all, size) = nearest_distances(points, &interrupted)?;
     // No cloud that hangs together has its points nearer than this: a curve is longer, a surface wider.
     let on_a_line = size / points.len() as f64;
     let have_twins = |distances: &[f64]| {
@@ -254,10 +462,10 @@ pub fn spacing(points: &[Point3<f64>]) -> f64 {
         twins as f64 > FEW_TWINS * distances.len() as f64
     };
     if !have_twins(&all) {
-        return mean_without_strays(all);
+        return Some(mean_without_strays(all));
     }
     let copies = one_of_each(points, |p| [0, 1, 2].map(|axis| (p[axis] + 0.0).to_bits()));
-    let (distances, _) = nearest_distances(&copies);
+    let (distances, _) = nearest_distances(&copies, &interrupted)?;
     let cell = on_a_line * (MERGED / TWIN);
     if have_twins(&distances) && cell > 0.0 {
         let middle = middle(points);
@@ -268,13 +476,13 @@ pub fn spacing(points: &[Point3<f64>]) -> f64 {
         // Twice, on lattices half a cell apart: a face of the part may lie in the border of one.
         let merged = one_of_each(&copies, |p| cell_of(p, 0.25));
         let merged = one_of_each(&merged, |p| cell_of(p, 0.75));
-        let spacing = mean_without_strays(nearest_distances(&merged).0);
+        let spacing = mean_without_strays(nearest_distances(&merged, &interrupted)?.0);
         // Else they are no twins: small, dense bodies that are far apart.
         if merged.len() >= copies.len() / MOST_TWINS && spacing >= GAP * cell {
-            return spacing;
+            return Some(spacing);
         }
     }
-    mean_without_strays(distances)
+    Some(mean_without_strays(distances))
 }
 
 /// Twins are nearer than points on a straight line by this factor. Of points at random on a line less than
@@ -330,16 +538,19 @@ fn mean_without_strays(mut distances: Vec<f64>) -> f64 {
 /// O(n) for points that fill a surface or a volume.
 #[must_use]
 pub fn mean_spacing(points: &[Point3<f64>]) -> f64 {
-    let (distances, _) = nearest_distances(points);
+    nearest_distances(points, || false).map_or(0.0, |(distances, _)| mean(&distances))
+}
+
+fn mean(distances: &[f64]) -> f64 {
     if distances.is_empty() { 0.0 } else { distances.iter().sum::<f64>() / distances.len() as f64 }
 }
 
 /// What [`mean_spacing`] is the mean of, none for fewer than two points; and the diagonal of the box around the bulk of
-/// the points.
-fn nearest_distances(points: &[Point3<f64>]) -> (Vec<f64>, f64) {
+/// the points. `None` once `interrupted` says so.
+fn nearest_distances(points: &[Point3<f64>], interrupted: impl Fn() -> bool) -> Option<(Vec<f64>, f64)> {
     let n = points.len();
     if n < 2 {
-        return (Vec::new(), 0.0);
+        return Some((Vec::new(), 0.0));
     }
     let middle = middle(points);
     let unit = points.iter().map(|p| (p.coords - middle).amax()).fold(0.0, f64::max).max(f64::MIN_POSITIVE);
@@ -349,19 +560,23 @@ fn nearest_distances(points: &[Point3<f64>]) -> (Vec<f64>, f64) {
     let bounds = rows.each_ref().map(|axis| bulk(axis));
     let widest = bounds.iter().fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
     let size = unit * Vector3::from(bounds.map(|(low, high)| f64::from(high - low))).norm();
-    let sorted = |cell| Sorted::new(&rows, Grid::in_box(&rows, bounds, cell));
-    let coarse = sorted(widest / (n as f32 / POINTS_PER_CELL).cbrt());
+    let sorted = |cell| {
+        let grid = Grid::in_box(&rows, bounds, cell);
+        let sorted = (!interrupted()).then(|| Sorted::new(&rows, grid));
+        sorted.filter(|_| !interrupted())
+    };
+    let coarse = sorted(widest / (n as f32 / POINTS_PER_CELL).cbrt())?;
     let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE));
     guess.sort_unstable_by(f64::total_cmp);
     // The median: a few far points must not make the cells of all others wide.
     let cell = CELL_PER_SPACING * (guess[guess.len() / 2] / unit) as f32;
     let distances = if cell < 0.7 * coarse.grid.cell_size() {
-        let fine = sorted(cell);
+        let fine = sorted(cell)?;
         fine.spacings(Some(&coarse), points, &fine.strata(SPACING_SAMPLE))
     } else {
         coarse.spacings(None, points, &coarse.strata(SPACING_SAMPLE))
     };
-    (distances, size)
+    Some((distances, size))
 }
 
 /// About how many points a cell of the first grid would hold if they filled a volume.
@@ -388,12 +603,28 @@ struct Sorted {
 
 impl Sorted {
     fn new(rows: &[Vec<f32>; 3], grid: Grid) -> Self {
-        let points = rows.each_ref().map(|axis| {
+        let sorted = Self::columns_of(rows, &grid);
+        let rows = grid.order().iter().copied().chain([NONE; LANES]).collect();
+        Self { grid, points: sorted, rows }
+    }
+
+    /// The same of columns whose rows are `ids`, ascending.
+    fn of(rows: &[Vec<f32>; 3], grid: Grid, ids: &[u32]) -> Self {
+        let sorted = Self::columns_of(rows, &grid);
+        let rows = grid.order().iter().map(|&row| ids[row as usize]).chain([NONE; LANES]).collect();
+        Self { grid, points: sorted, rows }
+    }
+
+    /// A radius that reaches beyond the cells around a place, and into the box of the points.
+    fn first_radius(&self, place: [f32; 3]) -> f32 {
+        2.0 * self.grid.cell_size() + self.grid.distance_to_box(place)
+    }
+
+    fn columns_of(rows: &[Vec<f32>; 3], grid: &Grid) -> [Vec<f32>; 3] {
+        rows.each_ref().map(|axis| {
             let sorted = grid.order().iter().map(|&i| axis[i as usize]);
             sorted.chain([f32::INFINITY; LANES]).collect()
-        });
-        let rows = grid.order().iter().copied().chain([NONE; LANES]).collect();
-        Self { grid, points, rows }
+        })
     }
 
     #[inline]
@@ -502,6 +733,9 @@ impl WithSimd for Spacings<'_> {
     }
 }
 
+/// After so many points of a run a search asks whether it can end.
+const LONG: usize = 1 << 10;
+
 /// What [`Grid::block`] holds for sure, in cells: half a one, less what rounding may cost.
 const SEEN: f32 = 0.499;
 
@@ -564,6 +798,10 @@ impl<'a, S: Simd> Search<'a, S> {
                 start += S::F32_LANES;
             }
             if start >= run.end {
+                return;
+            }
+            // None is nearer than one that coincides; where so many do, the rest need not be looked at.
+            if (start - run.start).is_multiple_of(LONG) && self.simd.reduce_min_f32s(self.dist_sq) == 0.0 {
                 return;
             }
         }

@@ -145,6 +145,9 @@ pub fn chance_fit(
     sum / samples.max(1) as f64
 }
 
+/// Points that are looked at for the fit of the target to itself: where the samples have so many neighbours fewer of them do.
+const MOST_LOOKED_AT: usize = 1 << 22;
+
 /// The fit of the target to itself, each of `samples` points to the nearest other one: no pose fits better than the
 /// noise of the scene lets it. 1 if no point has a neighbour.
 #[must_use]
@@ -156,10 +159,15 @@ pub fn own_fit(
     samples: usize,
 ) -> f64 {
     let (mut sum, mut count) = (0.0, 0_u32);
+    let mut num_looked_at = 0;
     for _ in 0..samples {
+        if num_looked_at > MOST_LOOKED_AT {
+            break;
+        }
         let i = rng.below(target.points.len());
         let gap_to = |row: &u32| target.points[i] - target.points[*row as usize];
         let others = nearby.within(&target.points[i], contact.distance).filter(|&row| row as usize != i);
+        let others = others.inspect(|_| num_looked_at += 1);
         let nearest = others
             .min_by(|a, b| gap_to(a).norm_squared().total_cmp(&gap_to(b).norm_squared()).then(a.cmp(b)));
         if let Some(row) = nearest {

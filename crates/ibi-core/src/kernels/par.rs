@@ -18,16 +18,14 @@ pub struct Pool {
 }
 
 impl Pool {
-    /// A pool of `num_threads`; `None` takes as many as the process may use.
+    /// A pool of `num_threads`; `None` takes as many as the process may use. More than [`most_threads`] are not started: they
+    /// would only stand in each other's way.
     ///
     /// # Errors
     /// [`Error::ThreadPool`] if the system refuses the threads.
     #[cfg(feature = "rayon")]
     pub fn new(num_threads: Option<usize>) -> Result<Self, Error> {
-        let n = num_threads
-            .or_else(|| std::thread::available_parallelism().ok().map(Into::into))
-            .unwrap_or(1)
-            .max(1);
+        let n = num_threads.unwrap_or_else(num_cores).clamp(1, most_threads());
         let threads = (n > 1).then(|| idle::take(n).map_or_else(|| idle::Threads::new(n), Ok)).transpose();
         Ok(Self { threads: threads.map_err(|e| Error::ThreadPool { reason: e.to_string() })? })
     }
@@ -41,6 +39,16 @@ impl Pool {
         Ok(Self {})
     }
 
+    /// How many threads it has.
+    #[must_use]
+    pub fn num_threads(&self) -> usize {
+        #[cfg(feature = "rayon")]
+        if let Some(threads) = &self.threads {
+            return threads.pool.current_num_threads();
+        }
+        1
+    }
+
     /// Runs `job`; the maps in it use this pool.
     pub fn install<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
         #[cfg(feature = "rayon")]
@@ -49,6 +57,17 @@ impl Pool {
         }
         job()
     }
+}
+
+/// Threads that the process may use.
+fn num_cores() -> usize {
+    std::thread::available_parallelism().map_or(1, Into::into)
+}
+
+/// Threads of a pool at most: four for each core that the process may use, but eight in any case.
+#[must_use]
+pub fn most_threads() -> usize {
+    (4 * num_cores()).max(8)
 }
 
 #[cfg(feature = "rayon")]
@@ -99,8 +118,11 @@ mod idle {
         Some(idle.remove(at))
     }
 
-    /// Keeps threads for later, at the expense of the oldest.
+    /// Keeps threads for later, at the expense of the oldest. Not more than there are cores, which nobody asks for twice.
     pub(super) fn put(threads: Threads) {
+        if threads.pool.current_num_threads() > super::num_cores().max(2) {
+            return;
+        }
         if let Ok(mut idle) = IDLE.try_lock() {
             idle.push(threads);
             if idle.len() > MOST {

@@ -15,7 +15,7 @@ use nalgebra::Isometry3;
 use crate::claims::Claims;
 use crate::correspondence::{Alive, PointPairs};
 use crate::error::Argument;
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::evidence::Support;
 use crate::kernels::graph::Graph;
 use crate::kernels::rng::Rng;
@@ -226,10 +226,17 @@ impl Context<'_> {
     /// What chance brings, measured when first asked for. Not to be asked first from within a parallel map: the
     /// measurement is one itself, and a thread that waits in it may take up another that waits for it.
     pub(crate) fn chance(&self) -> &Chance {
-        self.chance.get_or_init(|| Chance {
-            agreement: self.pairs.chances(self.scene, self.params),
-            fit: self.scene.chance_fit(self.params),
-            best_fit: self.scene.best_fit(self.params),
+        self.chance.get_or_init(|| {
+            let interrupt = self.interrupt;
+            if !interrupt.enter(Phase::Chance) {
+                return Chance::default();
+            }
+            let agreement = self.pairs.chances(self.scene, self.params, interrupt);
+            if interrupt.is_set() {
+                return Chance::default();
+            }
+            let [fit, best_fit] = [self.scene.chance_fit(self.params), self.scene.best_fit(self.params)];
+            Chance { agreement, fit, best_fit }
         })
     }
 
@@ -290,10 +297,11 @@ struct Near {
 
 /// Correspondences near a pose that are looked at for a glance, and for more.
 const GLANCE_NEAR: usize = 128;
-const LOOK_NEAR: usize = 1024;
+pub(crate) const LOOK_NEAR: usize = 1024;
 
-/// What chance brings in a scene.
-#[derive(Debug)]
+/// What chance brings in a scene. Nothing is to be read from it once the run was interrupted before it was measured: then no
+/// instance was found.
+#[derive(Debug, Default)]
 pub(crate) struct Chance {
     /// For each source point the share of all correspondences that would agree with it.
     agreement: Vec<f32>,

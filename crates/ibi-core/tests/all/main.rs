@@ -4,6 +4,7 @@
     clippy::unwrap_used,
     clippy::expect_used,
     clippy::float_cmp,
+    clippy::panic,
     reason = "tests may panic, and compare what is exact"
 )]
 
@@ -22,6 +23,7 @@ mod graph;
 mod hough3d;
 mod joint;
 mod kernels;
+mod limits;
 mod mock;
 mod nearby;
 mod nnsr;
@@ -29,6 +31,7 @@ mod oriented;
 #[cfg(feature = "serde")]
 mod params;
 mod refinement;
+mod scans;
 mod sight;
 mod symmetries;
 mod the_loop;

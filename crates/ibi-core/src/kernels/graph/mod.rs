@@ -16,6 +16,7 @@ use nalgebra::{Isometry3, Vector3};
 
 use super::columns::Columns;
 use super::par;
+pub use find::MAX_CROWD;
 use find::{Finder, Places};
 
 /// When two correspondences count as compatible. Lengths in the unit of the columns.
@@ -99,6 +100,10 @@ impl Graph {
         let (ids, mut edges) = Finder { places, normals, test }.find(&interrupted);
         if test.second_order {
             edges.weigh_by_common_neighbors(&interrupted);
+        }
+        if interrupted() {
+            // All that comes is quick without edges.
+            edges = Edges { starts: vec![0; edges.starts.len()], neighbors: Vec::new(), weights: Vec::new() };
         }
         let mut graph = edges.mirrored();
         graph.nodes = vec![NONE; pairs.len()];

@@ -1,6 +1,6 @@
 use crate::error::Error;
 use crate::kernels::by_target::ball;
-use crate::kernels::compatibility::{vote_reach, votes};
+use crate::kernels::compatibility::{vote_reach, votes_until};
 use crate::params::at_least_3;
 use crate::stages::{Context, Enhance, Ranked};
 
@@ -42,7 +42,11 @@ impl Enhance for Voting {
             .map(|at| (by_target.id(at), at as u32))
             .filter(|&(id, _)| context.alive.contains(id))
             .unzip();
-        let votes = votes(&by_target.sorted().gather(&places), &voters, delta_r);
+        let votes =
+            votes_until(&by_target.sorted().gather(&places), &voters, delta_r, || context.interrupt.is_set());
+        if context.interrupt.is_set() {
+            return Ranked::default();
+        }
         // PAPER: the N_vot best, whatever they have. Those without a vote are taken at random, and removal `dense` would
         // take them out for nothing.
         let voted = ids.into_iter().zip(votes).filter(|&(_, votes)| votes > 0.0);

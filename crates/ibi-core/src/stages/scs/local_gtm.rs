@@ -2,6 +2,7 @@ use std::cmp::Reverse;
 
 use super::gtm::OTSU_BINS;
 use crate::error::Error;
+use crate::interrupt::Phase;
 use crate::kernels::graph::{EdgeTest, Graph};
 use crate::kernels::otsu::otsu;
 use crate::kernels::replicator::{Payoffs, replicator};
@@ -82,6 +83,9 @@ impl LocalGtm {
     }
 
     fn build(&self, context: &Context<'_>) -> Graph {
+        if !context.interrupt.enter(Phase::Graph) {
+            return Graph::default();
+        }
         // Interrupted, nobody looks at the graph.
         let source = context.scene.source;
         let diameter_pr =

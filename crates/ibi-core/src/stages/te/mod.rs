@@ -76,8 +76,11 @@ fn compatibility_graph(
 /// Members of `C_d` that a dense graph may have as nodes: its weights take 4 MiB.
 const MAX_NODES: usize = 1024;
 
+/// Samples that are shared out to the threads in one go: once the run is interrupted even to skip ten million takes its time.
+const SAMPLES_AT_A_TIME: usize = 1 << 14;
+
 /// Fits a pose to each sample of ids, scores it by MAE on the alive correspondences (Eq. 7-8), and returns
-/// the best one; the earlier one of equals.
+/// the best one; the earlier one of equals. None once the run was interrupted.
 fn best_of<S: AsRef<[u32]> + Sync>(context: &Context<'_>, samples: &[S]) -> Option<Hypothesis> {
     let score = |s: usize| -> Option<(f32, Isometry3<f64>)> {
         if context.interrupt.is_set() {
@@ -87,9 +90,15 @@ fn best_of<S: AsRef<[u32]> + Sync>(context: &Context<'_>, samples: &[S]) -> Opti
         Some((mae(context.alive.columns(), &pose, context.params.t_he_pr), pose))
     };
     let mut best: Option<(f32, Isometry3<f64>)> = None;
-    for (mae, pose) in par::map(samples.len(), 4, score).into_iter().flatten() {
-        if best.is_none_or(|(top, _)| mae > top) {
-            best = Some((mae, pose));
+    for start in (0..samples.len()).step_by(SAMPLES_AT_A_TIME) {
+        if context.interrupt.is_set() {
+            return None;
+        }
+        let num = SAMPLES_AT_A_TIME.min(samples.len() - start);
+        for (mae, pose) in par::map(num, 4, |i| score(start + i)).into_iter().flatten() {
+            if best.is_none_or(|(top, _)| mae > top) {
+                best = Some((mae, pose));
+            }
         }
     }
     best.map(|(mae, target_from_source)| Hypothesis { target_from_source, score: f64::from(mae) })

@@ -1,6 +1,5 @@
 //! What scans bring along: points twice, far pixels, offsets. The spacing that all is measured by minds none of them,
 //! and where numbers are too coarse a cloud is refused.
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests may panic")]
 
 use ibi_core::kernels::nearby::{mean_spacing, spacing};
 use ibi_core::nalgebra::{Point3, Vector3};
