@@ -80,7 +80,7 @@ class Telling(ibi.Job):
     """Prints "ready" once its first stage begins."""
 
     def run(self, **options):
-        with watched(lambda phase: phase == "Select" and print("ready", flush=True)):
+        with watched(lambda phase: phase == "Select" and os.write(1, b"ready\n")):  # `print` is two writes
             return super().run(**options)
 
 

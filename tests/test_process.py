@@ -108,12 +108,11 @@ def ended(child):
 
 def interrupted(child):
     """The same of one that gets Ctrl-C once it prints "ready"."""
-    try:
-        assert child.stdout.readline() == "ready\n", child.communicate()
-        child.send_signal(signal.SIGINT)
-    except BaseException:
+    line = child.stdout.readline()
+    if line != "ready\n":
         child.kill()
-        raise
+        pytest.fail(f"{line!r}: {child.communicate()}")
+    child.send_signal(signal.SIGINT)
     return ended(child)
 
 
