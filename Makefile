@@ -1,5 +1,5 @@
 # Each target sets up what it needs in .venv, beside this file. Nothing is installed anywhere else, but that
-# `bench-peers` asks apt-get for PCL where it may.
+# `bench-peers` asks apt-get for PCL where it may, and what runs Open3D for the system libraries of that.
 # Stamp files in .venv/stamps remember what was done, so that a second run is quick.
 
 .DEFAULT_GOAL := help
@@ -35,6 +35,11 @@ demo: $(STAMPS)/package $(STAMPS)/group-demo ## register the example scenes and 
 test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and Python
 	cargo test --workspace --exclude ibi-py --all-features
 	$(BIN)/python -m pytest
+
+.PHONY: test-all
+test-all: cargo $(STAMPS)/package $(STAMPS)/open3d $(STAMPS)/group-all ## the same with all that is optional, none skipped (installs Open3D, Dask, Ray, Rerun)
+	cargo test --workspace --exclude ibi-py --all-features
+	$(BIN)/python -m pytest --none-skipped
 
 .PHONY: test-clusters
 test-clusters: $(STAMPS)/package $(STAMPS)/group-clusters ## run batches on a local cluster of Dask and of Ray (installs them)
@@ -92,6 +97,7 @@ bench-features: $(STAMPS)/package $(STAMPS)/open3d ## time the built-in features
 lint: cargo $(STAMPS)/package $(STAMPS)/group-lint $(STAMPS)/group-test ## check formatting, lints, types, stubs and Rust docs
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets --all-features -- -D warnings
+	cargo check -p ibi-core --tests --no-default-features
 	RUSTDOCFLAGS="-D warnings" cargo doc -p ibi-core --no-deps --all-features
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -141,6 +147,10 @@ $(STAMPS)/group-%: $(STAMPS)/venv pyproject.toml
 	@touch $@
 
 $(STAMPS)/open3d: $(STAMPS)/group-bench
+	@$(BIN)/python -c 'import open3d' 2>/dev/null || if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "make: installing what Open3D needs with apt-get"; apt-get update -qq || true; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+			libusb-1.0-0 libgl1 libgomp1 >/dev/null || true; fi
 	@$(BIN)/python -c 'import open3d' || { \
 		echo "make: Open3D cannot be loaded; on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1" >&2; exit 1; }
 	@touch $@

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -20,7 +19,7 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import _batch
-from test_process import LIMIT_S, scene_of
+from test_process import LIMIT_S, scene_of, watched
 
 TEE = Path(__file__).parents[1] / "examples/tee"
 SPAWN = multiprocessing.get_context("spawn")
@@ -61,15 +60,28 @@ class Deadly(ibi.Job):
             return super().run(**options)
         if self.name:
             Path(self.name).touch()
-        time.sleep(0.2)  # so that others are under way
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+OTHERS_HAVE_ENDED = threading.Event()
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Slow(ibi.Job):
+class Last(ibi.Job):
+    """Ends after the others, in a thread."""
+
     def run(self, **options):
-        time.sleep(0.3)
+        assert OTHERS_HAVE_ENDED.wait(LIMIT_S)
         return super().run(**options)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Telling(ibi.Job):
+    """Prints "ready" once its first stage begins."""
+
+    def run(self, **options):
+        with watched(lambda phase: phase == "Select" and os.write(1, b"ready\n")):  # `print` is two writes
+            return super().run(**options)
 
 
 def processes(method, workers=2):
@@ -178,10 +190,16 @@ def test_a_generator_is_asked_for_no_more_than_the_window():
 
 def test_results_wait_for_their_turn_and_progress_does_not():
     scene, told = SCENES[0], []
-    slow = Slow(MODEL, scene.tgt, scene.corr)
-    jobs = [slow, *(job_of(0) for _ in range(3))]
+    jobs = [Last(MODEL, scene.tgt, scene.corr), *(job_of(0) for _ in range(3))]
+
+    def tell(*ended):
+        told.append(ended)
+        if len(told) == 3:
+            OTHERS_HAVE_ENDED.set()
+
+    OTHERS_HAVE_ENDED.clear()
     with ThreadPoolExecutor(2) as pool:
-        found = list(ibi.register_batch(jobs, pool, callback=lambda *ended: told.append(ended)))
+        found = list(ibi.register_batch(jobs, pool, callback=tell))
     assert [index for index, _ in told][-1] == 0
     assert sorted(index for index, _ in told) == [0, 1, 2, 3]
     assert all(found[index] is value for index, value in told)
@@ -339,10 +357,13 @@ def test_cancelled_jobs_are_errors():
 # Ending early --------------------------------------------------------------------------------------------
 
 
-def long_job():
+def long_job(kind=ibi.Job):
+    """Thousands of short rounds: a batch ends between two of them."""
     scene = ibi.synth.outlier_layout(0, num_instances=3, num_correspondences=1000, outlier_ratio=0.7)
-    params = ibi.Params(max_rejections=None, t_s=3, scs=ibi.Gtm(n_gtm=2000), removal="dense")
-    return ibi.Job(ibi.Model(scene.src), scene.tgt, np.tile(scene.corr, (20, 1)), params)
+    params = ibi.Params(
+        max_rejections=None, t_s=3, scs=ibi.Gtm(n_gtm=500), ce=ibi.Voting(n_vot=3), removal="dense"
+    )
+    return kind(ibi.Model(scene.src), scene.tgt, np.tile(scene.corr, (20, 1)), params)
 
 
 def test_closing_ends_what_is_under_way():
@@ -353,30 +374,28 @@ def test_closing_ends_what_is_under_way():
 
     found = ibi.register_batch(jobs())
     assert len(next(found)) > 0
-    start = time.monotonic()
-    found.close()
-    assert time.monotonic() - start < LIMIT_S / 2
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(found.close).result(LIMIT_S)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("ibi-batch")]
 
 
 INTERRUPTED = """
-import sys, time
+import sys
 from functools import partial
 sys.path.insert(0, sys.argv[1])
 import ibi_rs as ibi, test_batch
 if __name__ == "__main__":
     executor = partial(test_batch.processes, "spawn") if sys.argv[2] == "processes" else None
-    print("ready", flush=True)
     try:
-        for found in ibi.register_batch([test_batch.long_job()] * 6, executor):
+        for found in ibi.register_batch([test_batch.long_job(test_batch.Telling)] * 6, executor):
             print("ran to its end")
     except KeyboardInterrupt:
-        print(time.monotonic(), flush=True)
+        print("interrupted")
 """
 
 
-@pytest.mark.parametrize("where", ["threads", "processes"])
-def test_ctrl_c_ends_a_batch(where, tmp_path):
+@pytest.mark.parametrize(("where", "workers"), [("threads", 1), ("processes", 2)])
+def test_ctrl_c_ends_a_batch(where, workers, tmp_path):
     script = tmp_path / "interrupted.py"
     script.write_text(INTERRUPTED)
     command = [sys.executable, str(script), os.path.dirname(__file__), where]
@@ -385,15 +404,12 @@ def test_ctrl_c_ends_a_batch(where, tmp_path):
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
-        assert child.stdout.readline() == "ready\n"
-        time.sleep(3)
+        for _ in range(workers):
+            assert child.stdout.readline() == "ready\n"
         os.killpg(child.pid, signal.SIGINT)
-        sent = time.monotonic()
         out, err = child.communicate(timeout=LIMIT_S)
     finally:
         child.kill()
     print(err)
     assert child.returncode == 0, err
-    latency_s = float(out) - sent
-    print(f"{where}: KeyboardInterrupt {latency_s:.3f} s after Ctrl-C")
-    assert latency_s < 5  # a round, on a machine that is busy with something else
+    assert [line for line in out.splitlines() if line != "ready"] == ["interrupted"]

@@ -10,9 +10,9 @@ from pathlib import Path
 import ibi_rs as ibi
 import pytest
 from test_batch import EXPECTED, JOBS, MODEL, SCENES, content, values
+from test_process import LIMIT_S
 
 NO_CLUSTERS = "large, so not in the group of the tests: `make test-clusters` installs it and has these run"
-LIMIT_S = 60
 
 
 @dataclass(frozen=True, eq=False, repr=False)

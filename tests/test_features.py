@@ -12,7 +12,7 @@ try:
     import open3d as o3d
 except ImportError:  # or one of the system libraries that it loads
     o3d = None
-NO_OPEN3D = "large, so not in the group of the tests: `make .venv/stamps/open3d test` has these run"
+NO_OPEN3D = "large, so not in the group of the tests: `make test-all` installs it and has these run"
 needs_open3d = pytest.mark.skipif(o3d is None, reason=NO_OPEN3D)
 
 

@@ -1,6 +1,7 @@
 """The table of inputs: what is taken as it is meant, what is refused and how, what finds nothing."""
 
 import tempfile
+from importlib.util import find_spec
 from typing import get_args
 
 import ibi_rs as ibi
@@ -29,8 +30,7 @@ def content(found):
 PLAIN = register()
 
 
-NO_OPEN3D = "large, so not in the group of the tests: `make .venv/stamps/open3d test` has these run"
-NO_TORCH = "large, so in no group: `.venv/bin/python -m pip install torch` has these run"
+NO_OPEN3D = "large, so not in the group of the tests: `make test-all` installs it and has these run"
 
 
 class Holder:
@@ -206,17 +206,21 @@ def test_objects_of_open3d():
     np.testing.assert_array_equal(ibi.Model.from_mesh(box).points, by_arrays.points)
 
 
-def test_tensors_of_torch():
-    torch = pytest.importorskip("torch", reason=NO_TORCH)
-    src, tgt, corr = map(torch.from_numpy, (SRC, TGT, CORR))
-    assert content(register(src, tgt, corr)) == content(PLAIN)
-    points = torch.hstack([src[corr[:, 0]], tgt[corr[:, 1]]])
-    assert content(register(src.half(), tgt.float(), points)) == content(PLAIN)
-    assert content(register(src, tgt, (points[:, :3], points[:, 3:]))) == content(PLAIN)
-    for tensor in (src.clone().requires_grad_(), src.bfloat16(), src.to("meta"), src.to_sparse()):
-        with pytest.raises(TypeError, match=r"^src cannot be read as an array: ") as caught:
-            register(src=tensor)
-        assert "\n" not in str(caught.value)
+# Gigabytes, so in no group; `OfTorch` stands for it, and above are Open3D's tensors.
+if find_spec("torch"):
+
+    def test_tensors_of_torch():
+        import torch
+
+        src, tgt, corr = map(torch.from_numpy, (SRC, TGT, CORR))
+        assert content(register(src, tgt, corr)) == content(PLAIN)
+        points = torch.hstack([src[corr[:, 0]], tgt[corr[:, 1]]])
+        assert content(register(src.half(), tgt.float(), points)) == content(PLAIN)
+        assert content(register(src, tgt, (points[:, :3], points[:, 3:]))) == content(PLAIN)
+        for tensor in (src.clone().requires_grad_(), src.bfloat16(), src.to("meta"), src.to_sparse()):
+            with pytest.raises(TypeError, match=r"^src cannot be read as an array: ") as caught:
+                register(src=tensor)
+            assert "\n" not in str(caught.value)
 
 
 # -----------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ import piles  # noqa: E402
 
 MESH = ibi.io.read_mesh(ROOT / "examples/models/cat.ply")
 SIZE = np.linalg.norm(np.ptp(MESH[0], axis=0))
-NO_OPEN3D = "large, so not in the group of the tests: `make .venv/stamps/open3d test` has these run"
+NO_OPEN3D = "large, so not in the group of the tests: `make test-all` installs it and has these run"
 needs_open3d = pytest.mark.skipif(o3d is None, reason=NO_OPEN3D)
 
 

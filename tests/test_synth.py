@@ -257,7 +257,7 @@ except ImportError:
     pass
 else:
     DESCRIPTORS["FPFH"] = None
-NO_OPEN3D = "large, so not in the group of the tests: `make .venv/stamps/open3d test` has these run"
+NO_OPEN3D = "large, so not in the group of the tests: `make test-all` installs it and has these run"
 needs_open3d = pytest.mark.skipif("FPFH" not in DESCRIPTORS, reason=NO_OPEN3D)
 each_descriptor = pytest.mark.parametrize("descriptors", DESCRIPTORS.values(), ids=DESCRIPTORS)
 
