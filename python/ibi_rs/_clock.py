@@ -38,6 +38,6 @@ class Clock:
 
 
 def _left_s() -> float | None:
-    """What the innermost clock leaves, if there is one."""
+    """Return what the innermost clock leaves, if there is one."""
     clock = _CLOCK.get()
     return None if clock is None else clock.left_s

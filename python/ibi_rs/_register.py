@@ -547,7 +547,7 @@ def _overridden(params: Params, max_instances: int | None, timeout_s: float | No
 
 
 def _timeout(spent_s: float, params: Params) -> StopReason:
-    """The stop reason, in the words of the core."""
+    """Say it in the words of the core."""
     message = f"timeout: {spent_s:.3f} s passed, {params.timeout_s:g} s allowed"
     return StopReason("timeout", message, spent_s, params.timeout_s)
 

@@ -172,7 +172,7 @@ def fpfh(
 
     Equal to Open3D's ``compute_fpfh_feature`` with ``KDTreeSearchParamHybrid(radius, max_neighbors)`` up to
     rounding: an angle at the edge of a bin may fall into the next one. Each of the three histograms of eleven
-    bins has a sum of 200; of 100 for a point whose neighbours all lie at its own place, and 0 for one without.
+    bins has a sum of 200, or 0 for a point without neighbours; 100 if they all lie at its own place.
 
     Parameters
     ----------
