@@ -82,8 +82,8 @@ def register(
         normals that count and are oriented, only source points that it can see count in the overlap: they
         face it, no other part of the model hides them, and nothing that it measured lies before them.
     num_threads : int, optional
-        Default: the environment variable ``IBI_NUM_THREADS``, else the cores the process may use. More than four
-        for each core, or eight, are not started. The result does not depend on it.
+        Default: the environment variable ``IBI_NUM_THREADS``, else the cores the process may use. More than
+        four for each core, or eight, are not started. The result does not depend on it.
     max_instances, timeout_s : optional
         Override those of ``params``.
     callback : callable, optional
@@ -111,8 +111,9 @@ def register(
     Notes
     -----
     The GIL is released. Ctrl-C ends the run within 0.1 s. Threads, if not more than the cores, wait for the
-    next call that wants as many; a process that was forked starts its own. Stages of your own are called in the thread that called
-    this function; an exception in one, Ctrl-C among them, ends the run and is raised as it is.
+    next call that wants as many; a process that was forked starts its own. Stages of your own are called in
+    the thread that called this function; an exception in one, Ctrl-C among them, ends the run and is raised
+    as it is.
 
     References
     ----------

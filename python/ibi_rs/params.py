@@ -99,10 +99,11 @@ class Params:
     max_rejections, max_rounds, max_instances
         A run ends after so many rounds without a new instance, rounds, or instances; None: no limit.
     timeout_s
-        A run ends after so many seconds and keeps what it has; None: no limit. What was found by then is still
-        checked and ranked as far as a bounded amount of work goes, enough for some hundred poses; a pose for
-        which it does not suffice is left out, so that each score is true. All of it counts: preparation, rounds
-        and the checks at the end. A run that is ended while it is prepared has no rounds and ``resolution`` 0.
+        A run ends after so many seconds and keeps what it has; None: no limit. What was found by then is
+        still checked and ranked as far as a bounded amount of work goes, enough for some hundred poses; a
+        pose for which it does not suffice is left out, so that each score is true. All of it counts:
+        preparation, rounds and the checks at the end. A run that is ended while it is prepared has no rounds
+        and ``resolution`` 0.
 
     Raises
     ------

@@ -46,6 +46,15 @@ const GRAIN: usize = 256;
 /// The same where a step is a look into memory.
 const GATHER: usize = 1 << 14;
 
+/// Where the cells within the radius hold so many times as many points as may count, the nearest are looked for within
+/// less, such that the cells hold about so many times as many, and then within twice as much.
+const CROWDED: f64 = 64.0;
+const FEW: f64 = 8.0;
+
+/// Points by which that is told, and how often it is narrowed at most.
+const SAMPLE: usize = 64;
+const MOST_NARROWINGS: usize = 16;
+
 /// Cells for each radius. Smaller ones fit the ball better and are more to walk through.
 const CELLS_PER_RADIUS: f64 = 1.5;
 
@@ -56,9 +65,11 @@ pub(super) struct Around {
     points: [Vec<f64>; 3],
     /// The same, one after the other, for those that count.
     rows: Vec<[f64; 3]>,
-    /// The same relative to the middle, in radii: where the grid has them.
+    /// The same relative to the middle, in reaches: where the grid has them.
     local: Vec<[f32; 3]>,
     neighborhood: Neighborhood,
+    /// How far is looked at first: the radius, or less where that holds far more points than may count.
+    reach: f64,
 }
 
 /// The neighbours of one point.
@@ -95,14 +106,30 @@ impl Others {
 }
 
 impl Around {
+    /// `Interrupted` is its only error.
     pub(super) fn new(
         points: &[Point3<f64>],
         neighborhood: Neighborhood,
         interrupt: &Interrupt,
     ) -> Result<Self, FeatureError> {
+        let mut around = Self::within(points, neighborhood, neighborhood.radius, interrupt)?;
+        for _ in 0..MOST_NARROWINGS {
+            let Some(reach) = around.narrower() else { break };
+            around = Self::within(points, neighborhood, reach, interrupt)?;
+        }
+        Ok(around)
+    }
+
+    /// For questions that go as far as `reach` at first.
+    fn within(
+        points: &[Point3<f64>],
+        neighborhood: Neighborhood,
+        reach: f64,
+        interrupt: &Interrupt,
+    ) -> Result<Self, FeatureError> {
         // Each step takes tens of milliseconds for millions of points.
         let proceed = || if interrupt.is_set() { Err(FeatureError::Interrupted) } else { Ok(()) };
-        let rows = columns(points, middle(points), neighborhood.radius);
+        let rows = columns(points, middle(points), reach);
         proceed()?;
         let grid = Grid::new(&rows, (1.0 / CELLS_PER_RADIUS) as f32);
         proceed()?;
@@ -117,7 +144,27 @@ impl Around {
         proceed()?;
         let local = |&row: &u32| rows.each_ref().map(|axis| axis[row as usize]);
         let local = par::chunks(order.len(), GATHER, |run| order[run].iter().map(local).collect::<Vec<_>>());
-        Ok(Self { points: columns, local: local.concat(), rows: sorted, grid, neighborhood })
+        Ok(Self { points: columns, local: local.concat(), rows: sorted, grid, neighborhood, reach })
+    }
+
+    /// A reach within which there should be a few times as many points as may count, if there are far more within the one at
+    /// hand.
+    fn narrower(&self) -> Option<f64> {
+        let n = self.local.len();
+        let mut counts: Vec<usize> = self
+            .local
+            .iter()
+            .step_by(n.div_ceil(SAMPLE).max(1))
+            .map(|&place| self.grid.around(place, 1.0).map(|run| run.len()).sum())
+            .collect();
+        if counts.is_empty() {
+            return None;
+        }
+        let half = counts.len() / 2;
+        let count = *counts.select_nth_unstable(half).1 as f64;
+        let most = self.neighborhood.max_neighbors as f64;
+        // As on a surface; in a volume it is less than could be, and then is doubled.
+        (count > CROWDED * most).then(|| self.reach * (FEW * most / count).sqrt())
     }
 
     /// The rows of the cloud by place.
@@ -178,18 +225,28 @@ impl Around {
     #[inline(always)]
     #[allow(clippy::inline_always)] // the body of the loop above
     fn find(&self, place: usize, others: &mut Others) {
-        (others.len, others.looked_at) = (0, 0);
-        others.radius_sq = self.neighborhood.radius * self.neighborhood.radius;
-        self.grid.each_around(
-            self.local[place],
-            1.0,
-            #[inline(always)]
-            |run| self.look(place, run, others),
-        );
-        let most = self.neighborhood.max_neighbors - 1;
+        let Neighborhood { radius, max_neighbors } = self.neighborhood;
+        let most = max_neighbors - 1;
+        let mut within = self.reach;
+        others.looked_at = 0;
+        loop {
+            others.len = 0;
+            others.radius_sq = within * within;
+            self.grid.each_around(
+                self.local[place],
+                (within / self.reach) as f32,
+                #[inline(always)]
+                |run| self.look(place, run, others),
+            );
+            if others.len >= most || within >= radius {
+                break;
+            }
+            within = (2.0 * within).min(radius);
+        }
         if others.len > most {
             self.keep_nearest(most, others);
         }
+        others.radius_sq = radius * radius;
     }
 
     #[inline(always)]
