@@ -14,6 +14,6 @@ files say what the weights have to be and where their path is looked for.
 """
 
 from .contract import Method, Missing, Register
-from .methods import METHODS
+from .methods import METHODS, available
 
-__all__ = ["METHODS", "Method", "Missing", "Register"]
+__all__ = ["METHODS", "Method", "Missing", "Register", "available"]

@@ -22,7 +22,7 @@ import ibi_rs as ibi
 import numpy as np
 from ibi_rs import synth
 
-MODELS = Path(__file__).parents[1] / "examples/models"
+MODELS = Path(__file__).parents[2] / "examples/models"
 FIRST_SEED = {"tuning": 0, "reporting": 5000}
 SEEDS_PER_HALF = 5000
 # Without normals as if none were given: the cosines of two angles never differ by more than 2.
