@@ -11,6 +11,7 @@ the share of scenes in which nothing was found.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -143,8 +144,8 @@ def main() -> None:
     for name in VARIANTS | NORMALS:
         show(line([name, *(cell(of_layout.get(name, ())) for of_layout in results.values())]))
     if args.records:
-        rows = [row for layout, of in results.items() for row in accuracy.rows(layout, args.half, of)]
-        records.write(args.records, "ablation.csv", rows, accuracy.COLUMNS)
+        rows = [runs.rows(of, "params", layout=name, half=args.half) for name, of in results.items()]
+        records.write(args.records, "ablation.csv", [*chain(*rows)], accuracy.COLUMNS)
         scene = scene_of(PICTURED[0], args.half, args.seed)
         found = {name: register(scene, params) for name, params in variants(PICTURED[0]).items()}
         draw(scene, found, args.pictures / "ablation.png")

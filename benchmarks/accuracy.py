@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import ibi_rs as ibi
 import numpy as np
@@ -53,12 +52,6 @@ def run(
     methods = {name: partial(ours.prepare, params=of, num_threads=threads) for name, of in presets.items()}
     make = partial(scene_of, layout, half, modelnet=modelnet)
     return runs.run_each(make, todo, methods, spec.shapes == "symmetric", jobs)
-
-
-def rows(layout: str, half: str, outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
-    """Return what the record holds: a line per preset and scene."""
-    head = {"version": ibi.__version__, "layout": layout, "half": half}
-    return [{**head, "params": name, **o.columns()} for name, of in outcomes.items() for o in of]
 
 
 HEAD = (
@@ -106,7 +99,8 @@ def main() -> None:
         print_table(layout, args.half, outcomes)
         # Not everybody has the clouds of ModelNet.
         folder = args.records if args.out or LAYOUTS[layout].shapes != "modelnet" else None
-        records.write(folder, f"{layout}.csv", rows(layout, args.half, outcomes), COLUMNS)
+        rows = runs.rows(outcomes, "params", layout=layout, half=args.half)
+        records.write(folder, f"{layout}.csv", rows, COLUMNS)
 
 
 if __name__ == "__main__":

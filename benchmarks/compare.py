@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -57,18 +58,15 @@ def ratios(outcomes: Outcomes, name: str) -> list[float]:
     return [float(np.median(np.divide(theirs.seconds, ours.seconds))) for theirs, ours in pairs]
 
 
-def rows(layout: str, outcomes: Outcomes, versions: dict[str, str]) -> list[dict[str, Any]]:
-    """Return what the record holds of the methods that ran."""
-    return [
-        {**head(layout, name), "version": versions[name], **outcome.columns(), "ratio": f"{ratio:.3f}"}
-        for name, of_method in outcomes.items()
-        for outcome, ratio in zip(of_method, ratios(outcomes, name), strict=True)
-    ]
-
-
-def head(layout: str, name: str) -> dict[str, Any]:
-    """Return what the record holds of every method."""
-    return {"layout": layout, "method": name, "threads": METHODS[name].threads}
+def rows(
+    layout: str, outcomes: Outcomes, versions: dict[str, str], missing: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Return what the record holds of a layout."""
+    held = runs.rows(outcomes, layout=layout)
+    for row, ratio in zip(held, chain(*(ratios(outcomes, name) for name in outcomes)), strict=True):
+        row |= {"ratio": f"{ratio:.3f}", "version": versions[row["method"]]}
+    held += [{"layout": layout, "method": name, "missing": reason} for name, reason in missing.items()]
+    return [{**row, "threads": METHODS[row["method"]].threads} for row in held]
 
 
 # Output ---------------------------------------------------------------------------------------------------
@@ -182,8 +180,7 @@ def main() -> None:
         here = [name for name in versions if applies(name, layout)]
         by_layout[layout] = compare(layout, todo, here, args.repeats)
         print_table(layout, args.half, by_layout[layout], missing)
-        record += rows(layout, by_layout[layout], versions)
-        record += [{**head(layout, name), "missing": reason} for name, reason in missing.items()]
+        record += rows(layout, by_layout[layout], versions, missing)
     if args.records and not args.tune:
         records.write(args.records, "peers.csv", record, COLUMNS)
         draw(args.pictures / "peers.png", by_layout)

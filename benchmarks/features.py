@@ -133,12 +133,17 @@ def tasks() -> Iterator[Task]:
     yield fpfh_task(size, scan["tgt"], scan["tgt_normals"], 6 * voxel, 150)
 
     cloud = in_open3d(points)
+
+    def open3d_normals() -> Any:
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.045, 30))
+        return cloud
+
     yield Task(
         "normals",
         f"{data}, at most 30 around",
         lambda: features.estimate_normals(points, 0.045, 30),
         "Open3D",
-        lambda: cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.045, 30)) or cloud,
+        open3d_normals,
         turned,
     )
     many, _ = sheet_and_ball(300_000)

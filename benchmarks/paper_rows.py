@@ -92,14 +92,6 @@ def paper(data: str) -> ibi.Params:
     return ibi.Params.paper_real() if is_real(data) else ibi.Params.paper_synthetic()
 
 
-def _variant(stage: str, name: str, base: ibi.Params, word: str) -> Row:
-    """Swap one stage for a variant with its defaults; a build without it says so."""
-    variant = getattr(ibi, name, None)
-    if variant is None:
-        return Row(f"{stage.upper()} {word}", missing="not in this build")
-    return Row(f"{stage.upper()} {word}", base.replace(**{stage: variant()}))
-
-
 def main_rows(data: str) -> Iterator[Row]:
     """All presets of ours, and the peers."""
     yield Row("default", ibi.Params())
@@ -118,14 +110,15 @@ def module_rows(data: str) -> Iterator[Row]:
     """Swap one module."""
     base = paper(data)
     yield Row("paper preset", base)
-    yield _variant("scs", "Nnsr", base, "nnsr")
-    yield _variant("scs", "Hough3d", base, "hough3d")
-    yield _variant("ce", "Off", base, "off")
-    yield _variant("te", "Ransac", base, "ransac")
-    yield _variant("te", "SacCot", base, "sac_cot")
-    yield _variant("te", "Mac", base, "mac")
-    yield _variant("hv", "None_", base, "none")
-    yield _variant("hv", "InlierCount", base, "inlier_count")
+    variants = {
+        "scs": (ibi.Nnsr(), ibi.Hough3d()),
+        "ce": (ibi.Off(),),
+        "te": (ibi.Ransac(), ibi.SacCot(), ibi.Mac()),
+        "hv": (ibi.None_(), ibi.InlierCount()),
+    }
+    for stage, others in variants.items():
+        for other in others:
+            yield Row(f"{stage.upper()} {other.variant}", base.replace(**{stage: other}))
 
 
 def validation_rows(data: str) -> Iterator[Row]:
@@ -185,12 +178,10 @@ def _ecc_reasons() -> Iterator[Row]:
     for count in (20, 50):
         counted = base.replace(hv=ibi.InlierCount(t_inliers=count), t_he_pr=1)
         yield Row(f"inlier_count {count}, t_he 1 pr", counted)
-    as_drawn = {"rigid": False}
-    yield Row("T-Linkage, triplets as drawn", peer="T-Linkage", change=as_drawn)
-    anywhere = as_drawn | {"neighbors": None}
-    yield Row("T-Linkage, triplets as drawn, from anywhere", peer="T-Linkage", change=anywhere)
-    yield Row("Progressive-X, triplets as drawn", peer="Progressive-X", change=as_drawn)
-    yield Row("Progressive-X, triplets as drawn, from anywhere", peer="Progressive-X", change=anywhere)
+    for name in ("T-Linkage", "Progressive-X"):
+        as_drawn = f"{name}, triplets as drawn"
+        yield Row(as_drawn, peer=name, change={"rigid": False})
+        yield Row(f"{as_drawn}, from anywhere", peer=name, change={"rigid": False, "neighbors": None})
     yield Row("ECC, settings of its paper", peer="ECC", change={"inlier": 0.3, "t_merge": 0.2})
 
 
@@ -214,12 +205,12 @@ def _scan_reasons() -> Iterator[Row]:
         yield Row(f"t_overlap {share:g}", base.replace(hv=ibi.Overlap(t_overlap=share)))
     # Without validation: what was lost before it.
     free = base.replace(hv=ibi.None_())
+    wide = free.replace(t_he_pr=3)
+    few = _with(wide, ce={"n_vot": 50})
     yield Row("HV none", free)
-    free = free.replace(t_he_pr=3)
-    yield Row("HV none, t_he 3 pr", free)
-    free = _with(free, ce={"n_vot": 50})
-    yield Row("HV none, t_he 3 pr, N_vot 50", free)
-    yield Row("the same, δ_r 2 pr, SCS local_gtm", free.replace(delta_r_pr=2, scs=ibi.LocalGtm()))
+    yield Row("HV none, t_he 3 pr", wide)
+    yield Row("HV none, t_he 3 pr, N_vot 50", few)
+    yield Row("the same, δ_r 2 pr, SCS local_gtm", few.replace(delta_r_pr=2, scs=ibi.LocalGtm()))
 
 
 TABLES = {

@@ -23,7 +23,6 @@ the correspondences, and of the search for poses. Ours are medians of `--repeats
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -35,7 +34,7 @@ import ibi_rs as ibi
 import numpy as np
 import numpy.typing as npt
 from frame import cli, records, tables
-from frame.layouts import FIRST_SEED, MODELS
+from frame.layouts import FIRST_SEED, MODELS, index
 from frame.records import Row
 from frame.runs import spacing
 from frame.scans import FOLDER, Case, Detection, detect, pile, real
@@ -101,8 +100,7 @@ def shapes(folder: Path = FOLDER / "models" if FOLDER else MODELS) -> dict[str, 
 
     The index of the shipped meshes says which are; one that is not in it is measured.
     """
-    index = json.loads((MODELS / "index.json").read_text(encoding="utf-8"))
-    known = {entry["file"]: entry["symmetric"] for entry in index}
+    known = {entry["file"]: entry["symmetric"] for entry in index()}
 
     def is_symmetric(path: Path) -> bool:
         if path.name in known:
@@ -240,7 +238,7 @@ def tune(cases: Sequence[Case], with_settings: bool) -> None:
             start = time.perf_counter()
             for case, (model, scene) in zip(cases, given, strict=True):
                 register = METHODS[name].prepare(scene, peer.settings | settings | {"least": None})
-                candidates = register(scene)
+                candidates = np.asarray(register(scene))
                 # The check alone differs, so that the candidates are made once.
                 radius = 1.5 * spacing(scene.src)
                 for least in LEAST:

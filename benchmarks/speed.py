@@ -160,7 +160,7 @@ def outliers(
 
 def first(count: int, *scene: Any, **options: Any) -> Callable[[], Iterator[synth.Scene]]:
     """Return what makes `outliers` of so many seeds."""
-    return lambda: (outliers(*scene, seed, **options) for seed in range(count))
+    return lambda: (outliers(*scene, seed=seed, **options) for seed in range(count))
 
 
 USUAL = first(4, 5000, 20, (0.7, 0.9))

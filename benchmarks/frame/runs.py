@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar
 
+import ibi_rs as ibi
 import numpy as np
 import numpy.typing as npt
 from ibi_rs import metrics, synth
@@ -23,7 +24,8 @@ from scipy.spatial import cKDTree
 
 from .timing import timed
 
-Key, Answer = TypeVar("Key"), TypeVar("Answer")
+Key = TypeVar("Key")
+Answer = TypeVar("Answer")
 
 Register = Callable[[synth.Scene], npt.ArrayLike]
 """Gives the poses found in a scene, (K, 4, 4), best first. On the clock."""
@@ -142,6 +144,12 @@ def in_processes(task: Callable[[Key], Answer], keys: Iterable[Key], jobs: int) 
     # Open3D's threads do not survive a fork.
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         return list(pool.map(task, keys))
+
+
+def rows(outcomes: Mapping[str, Iterable[Outcome]], key: str = "method", **head: Any) -> list[dict[str, Any]]:
+    """Return what a record may hold: a line per method and scene, with the method's name in a column."""
+    head["version"] = ibi.__version__
+    return [{**head, key: name, **one.columns()} for name, of in outcomes.items() for one in of]
 
 
 # Sums -----------------------------------------------------------------------------------------------------
