@@ -6,6 +6,8 @@
     Real scans and ray-cast piles, and the detection of parts in them on the clock.
 `runs`
     Methods on scenes, in turn and timed, in one process or several, and scored.
+`ours`
+    This package as a method, behind the same contract as the other programs in benchmarks/peers.
 `timing`
     The clock, runs in turn, the growth of a time with a size.
 `records`
@@ -14,6 +16,4 @@
     Markdown, and figures.
 `cli`
     Arguments that several have, and the line that names the machine.
-
-Other programs are in benchmarks/peers, each behind the same contract as ours.
 """
