@@ -10,22 +10,21 @@ the share of scenes in which nothing was found.
 
 from __future__ import annotations
 
-import argparse
-import os
-import platform
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import accuracy
 import ibi_rs as ibi
 import numpy as np
-from accuracy import RECORDS, Result, register, run, write_record
+from frame import cli, plots, records, runs
+from frame.layouts import LAYOUTS, NO_NORMALS, scene_of
+from frame.ours import register
+from frame.runs import Outcome
+from frame.tables import head, line, show
 from ibi_rs import metrics, synth
-from layouts import FIRST_SEED, LAYOUTS, NO_NORMALS, scene_of
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
-
-FIGURES = Path(__file__).parents[1] / "docs/figures"
 
 DEFAULT = ibi.Params()
 VARIANTS = {
@@ -53,23 +52,12 @@ def variants(layout: str) -> dict[str, ibi.Params]:
 # Table ----------------------------------------------------------------------------------------------------
 
 
-def cell(rows: list[Result]) -> str:
+def cell(outcomes: Sequence[Outcome]) -> str:
     """Sum up one variant on one layout."""
-    if not rows:
+    if not outcomes:
         return "–"
-    mhf1 = metrics.mean_score(row.one_to_one for row in rows).mhf1
-    poses = sum(row.one_to_one.num_predicted for row in rows)
-    truths = sum(row.one_to_one.num_truth for row in rows)
-    return f"{mhf1:.3f} · {poses}/{truths} · {np.median([row.ms for row in rows]):.0f}"
-
-
-def print_table(results: dict[str, list[Result]]) -> None:
-    """Print a line per variant, a column per layout, as Markdown."""
-    print("\nMHF1 · poses returned / instances present · median ms\n")
-    print(f"| | {' | '.join(results)} |\n|---|{'---|' * len(results)}")
-    for name in VARIANTS | NORMALS:
-        cells = [cell([row for row in rows if row.params == name]) for rows in results.values()]
-        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    poses, truths = runs.num_poses(outcomes), runs.num_truths(outcomes)
+    return f"{runs.mean(outcomes).mhf1:.3f} · {poses}/{truths} · {runs.median_ms(outcomes):.0f}"
 
 
 # Picture --------------------------------------------------------------------------------------------------
@@ -95,25 +83,23 @@ def draw(scene: synth.Scene, found: dict[str, ibi.Registration], path: Path) -> 
     """Draw the scene once for each variant: right poses, wrong ones, missed instances."""
     columns = 4
     rows = -(-len(found) // columns)
-    figure = Figure(figsize=(3.5 * columns, 3.9 * rows + 0.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    size = (3.5 * columns, 3.9 * rows + 0.4)
+    figure, panels = plots.panels(size, columns, rows, count=len(found))
     plane = view(scene.poses)
     # All instances and poses, and a margin: the clutter goes on beyond.
     middles = np.vstack([scene.poses, *(np.asarray(registration) for registration in found.values())])
     flat = middles[:, :3, 3] @ plane
     limits = flat.min(axis=0) - 1.2, flat.max(axis=0) + 1.2
-    for i, (name, registration) in enumerate(found.items()):
-        axes = figure.add_subplot(rows, columns, i + 1)
+    for axes, (name, registration) in zip(panels, found.items(), strict=True):
         draw_one(axes, scene, registration, plane)
         axes.set(xlim=(limits[0][0], limits[1][0]), ylim=(limits[0][1], limits[1][1]))
         score = metrics.score_scene(registration, scene.poses)
         right, wrong = score.num_predicted_hit, score.num_predicted - score.num_predicted_hit
         missed = score.num_truth - score.num_truth_hit
         axes.set_title(f"{name}\n{right} right, {wrong} wrong, {missed} missed")
-    handles = figure.axes[0].get_legend_handles_labels()[0]
+    handles = panels[0].get_legend_handles_labels()[0]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=90)
+    plots.save(figure, path, 90)
     print(f"\npicture: {path.name}, {scene.name}")
 
 
@@ -146,35 +132,23 @@ def draw_one(axes: Any, scene: synth.Scene, found: ibi.Registration, plane: np.n
 
 def main() -> None:
     """Run, print, record, draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--half", choices=FIRST_SEED, default="reporting")
-    parser.add_argument("--scenes", type=int, default=10, help="so many of each layout; default: 10")
-    parser.add_argument("--jobs", type=int, default=1, help="processes; times are then those of one thread")
-    parser.add_argument("--seed", type=int, default=PICTURED[1], help="of the scene in the picture")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        help="folder for the record and the picture; by default benchmarks/records and docs/figures, and "
-        "none at all where an option is not the default",
-    )
-    args = parser.parse_args()
-    usual = all(parser.get_default(name) == value for name, value in vars(args).items())
-    print(f"{os.cpu_count()} cores, {platform.machine()}, ibi_rs {ibi.__version__}, {args.half} half", end="")
-    print(f", {args.scenes} scenes a layout")
+    seed = cli.option("--seed", type=int, default=PICTURED[1], help="of the scene in the picture")
+    args = cli.parse(__doc__, cli.HALF, cli.scenes(10), cli.JOBS, seed, cli.out())
+    cli.machine(f"{args.half} half", f"{args.scenes} scenes a layout")
     results = {
-        layout: run(layout, args.half, args.scenes, variants(layout), jobs=args.jobs) for layout in ABLATED
+        layout: accuracy.run(layout, args.half, args.scenes, variants(layout), jobs=args.jobs)
+        for layout in ABLATED
     }
-    print_table(results)
-    if usual or args.out:
-        write_record(
-            (args.out or RECORDS) / "ablation.csv", [row for rows in results.values() for row in rows]
-        )
-        layout, _ = PICTURED
-        scene = scene_of(layout, args.half, args.seed)
-        found = {name: register(scene, params) for name, params in variants(layout).items()}
-        draw(scene, found, (args.out or FIGURES) / "ablation.png")
+    print("\nMHF1 · poses returned / instances present · median ms\n")
+    show(head(["", *results]))
+    for name in VARIANTS | NORMALS:
+        show(line([name, *(cell(of_layout.get(name, ())) for of_layout in results.values())]))
+    if args.records:
+        rows = [runs.rows(of, "params", layout=name, half=args.half) for name, of in results.items()]
+        records.write(args.records, "ablation.csv", [*chain(*rows)], accuracy.COLUMNS)
+        scene = scene_of(PICTURED[0], args.half, args.seed)
+        found = {name: register(scene, params) for name, params in variants(PICTURED[0]).items()}
+        draw(scene, found, args.pictures / "ablation.png")
 
 
 if __name__ == "__main__":

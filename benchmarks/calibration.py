@@ -4,8 +4,8 @@
     python benchmarks/calibration.py --fit             # the weights anew, from the tuning half
 
 The default preset runs with a threshold near 0, so that it returns poses of all scores, on every layout of
-benchmarks/layouts.py whose shapes have neither symmetries nor near-copies. A pose is right if it is a hit one
-to one, below 20 degrees and 0.5 radii. Wrong poses above 0.9 are listed, each with what it is.
+benchmarks/frame/layouts.py whose shapes have neither symmetries nor near-copies. A pose is right if it is a
+hit one to one, below 20 degrees and 0.5 radii. Wrong poses above 0.9 are listed, each with what it is.
 
 With --fit nothing is drawn: a logistic regression over the poses of the tuning half gives the weights that
 crates/ibi-core/src/kernels/evidence.rs turns evidence, closeness and back_fit into log odds with. Each layout
@@ -14,25 +14,21 @@ weighs the same; scenes of which each object has lost 30 to 60 % of its points t
 
 from __future__ import annotations
 
-import argparse
-import csv
-import os
-import platform
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import cycle, pairwise
 from pathlib import Path
 
 import ibi_rs as ibi
 import numpy as np
-from accuracy import RECORDS, register
-from layouts import FIRST_SEED, LAYOUTS, scenes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from frame import cli, plots, records
+from frame.layouts import FIRST_SEED, LAYOUTS, scenes
+from frame.ours import register
+from frame.tables import markdown, show
 from matplotlib.ticker import PercentFormatter
 from scipy.spatial import cKDTree
 
-FIGURES = Path(__file__).parents[1] / "docs/figures"
 PARAMS = ibi.Params(hv=ibi.Evidence(t_score=0.01))
 PLAIN = [name for name, spec in LAYOUTS.items() if spec.shapes == "plain" and not spec.near_copies]
 BINS = (0, 0.1, 0.5, 0.7, 0.9, 0.99, 1)
@@ -58,20 +54,28 @@ class Judged:
         return self.what == "right"
 
 
-def judge(layout: str, scenes: Iterator[ibi.synth.Scene]) -> list[Judged]:
+def judged(
+    layout: str,
+    scene: str,
+    found: ibi.Registration,
+    score: ibi.metrics.SceneScore,
+    mistake: Callable[[ibi.Pose], str] = lambda pose: "wrong",
+) -> Iterator[Judged]:
+    """Judge every pose by what it was scored."""
+    for pose, match in zip(found, score.matches, strict=True):
+        what = "right" if match is not None and match.is_hit else mistake(pose)
+        yield Judged(layout, scene, pose.score, pose.evidence, pose.closeness, pose.back_fit, what)
+
+
+def judge(layout: str, scenes: Iterable[ibi.synth.Scene]) -> Iterator[Judged]:
     """Register scenes and judge every pose."""
-    judged = []
     for scene in scenes:
         found = register(scene, PARAMS)
-        matches = ibi.metrics.score_scene(found, scene.poses).matches
-        for pose, match in zip(found, matches, strict=True):
-            what = "right" if match is not None and match.is_hit else mistake(scene, pose, found.resolution)
-            measured = (pose.score, pose.evidence, pose.closeness, pose.back_fit)
-            judged.append(Judged(layout, scene.name, *measured, what))
-    return judged
+        score = ibi.metrics.score_scene(found, scene.poses)
+        yield from judged(layout, scene.name, found, score, partial(mistake, scene, found.resolution))
 
 
-def mistake(scene: ibi.synth.Scene, pose: ibi.Pose, pr: float) -> str:
+def mistake(scene: ibi.synth.Scene, pr: float, pose: ibi.Pose) -> str:
     """Say what a wrong pose is."""
     matrix, middle = pose.target_from_source, np.append(scene.src.mean(axis=0), 1)
     if len(scene.poses):
@@ -131,27 +135,13 @@ def by_score(poses: list[Judged]) -> list[Bin]:
 
 def print_bins(title: str, bins: list[Bin]) -> None:
     """Print a table as Markdown."""
-    print(f"\n| {title} | poses | mean score | share right |\n|---|---|---|---|")
-    for b in bins:
-        print(f"| {b.name} | {b.num} | {b.mean_score:.3f} | {b.share_right:.3f} |", flush=True)
-
-
-def write_record(path: Path, poses: list[Judged]) -> None:
-    """Write a line per pose."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        out = csv.DictWriter(file, [field.name for field in fields(Judged)], lineterminator="\n")
-        out.writeheader()
-        for pose in poses:
-            row = asdict(pose)
-            out.writerow({key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()})
+    lines = [(b.name, b.num, f"{b.mean_score:.3f}", f"{b.share_right:.3f}") for b in bins]
+    show(f"\n{markdown((title, 'poses', 'mean score', 'share right'), lines)}")
 
 
 def draw(bins: list[Bin], path: Path) -> None:
     """Draw the share of right poses over the score."""
-    figure = Figure(figsize=(6, 5.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    figure, (axes,) = plots.panels((6, 5.4), 1)
     axes.plot([0, 1], [0, 1], color="0.6", linestyle="--", zorder=1, label="perfectly calibrated")
     x, y = [b.mean_score for b in bins], [b.share_right for b in bins]
     low, high = np.transpose([b.interval() for b in bins])
@@ -165,8 +155,7 @@ def draw(bins: list[Bin], path: Path) -> None:
     axes.set_aspect("equal")
     axes.grid(color="0.9")
     axes.legend(loc="lower right", title="numbers: poses in the bin")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    plots.save(figure, path, 100)
 
 
 def calibrate(half: str, count: int) -> list[Judged]:
@@ -203,15 +192,21 @@ def cut(scene: ibi.synth.Scene, seed: int, num_points: int = 256) -> ibi.synth.S
     return replace(scene, tgt=scene.tgt[keep], corr=corr, similarity=None)
 
 
-def logistic(features: np.ndarray, is_right: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weights of a constant and the features, by Newton's method."""
+def logistic(
+    features: np.ndarray,
+    is_right: np.ndarray,
+    weight: np.ndarray,
+    ridge: float = RIDGE,
+    offset: np.ndarray | float = 0,
+) -> np.ndarray:
+    """Weights of a constant and the features, by Newton's method; the offset is added to their sum."""
     x = np.column_stack([np.ones(len(features)), features])
-    ridge = RIDGE * np.diag([0.0, *np.var(features, axis=0)])
+    hold = ridge * np.diag([0.0, *np.var(features, axis=0)])
     beta = np.zeros(x.shape[1])
     for _ in range(100):
-        p = 1 / (1 + np.exp(-x @ beta))
-        gradient = x.T @ (weight * (is_right - p)) - ridge @ beta
-        hessian = (x.T * (weight * p * (1 - p))) @ x + ridge
+        p = 1 / (1 + np.exp(-x @ beta - offset))
+        gradient = x.T @ (weight * (is_right - p)) - hold @ beta
+        hessian = (x.T * (weight * p * (1 - p))) @ x + hold
         step = np.linalg.solve(hessian, gradient)
         beta += step * min(1.0, 5.0 / np.abs(step).max())
         if np.abs(step).max() < 1e-8:
@@ -222,14 +217,10 @@ def logistic(features: np.ndarray, is_right: np.ndarray, weight: np.ndarray) -> 
 def fit(half: str, count: int) -> None:
     """Fit the weights and print them beside what they are fitted to."""
     chosen = [name for name in PLAIN if name != "ecc-0.3"]
-    sources: dict[str, Callable[[], Iterator[ibi.synth.Scene]]] = {
-        name: lambda name=name: scenes(name, half, count) for name in chosen
-    }
+    sources: dict[str, Iterable[ibi.synth.Scene]] = {name: scenes(name, half, count) for name in chosen}
     for name in ("ecc-0.02", "ecc-0.1"):
-        sources[f"{name}, cut"] = lambda name=name: (
-            cut(scene, seed) for seed, scene in enumerate(scenes(name, half, count))
-        )
-    poses = [pose for name, make in sources.items() for pose in judge(name, make())]
+        sources[f"{name}, cut"] = map(cut, scenes(name, half, count), range(count))
+    poses = [pose for name, of_name in sources.items() for pose in judge(name, of_name)]
     by_layout = {name: [p for p in poses if p.layout == name] for name in sources}
     print_bins("layout", [summary(name, group) for name, group in by_layout.items() if group])
 
@@ -253,31 +244,27 @@ def fit(half: str, count: int) -> None:
 
 def main() -> None:
     """Run, print, record, draw; or fit."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    args = cli.parse(
+        __doc__,
+        cli.flag("--fit", "fit the weights to the tuning half instead"),
+        cli.option("--half", choices=FIRST_SEED, help="default: reporting; with --fit tuning"),
+        cli.scenes(None, "so many of each layout; default: 6, with --fit 10"),
+        cli.out(),
     )
-    parser.add_argument("--fit", action="store_true", help="fit the weights to the tuning half instead")
-    parser.add_argument("--half", choices=FIRST_SEED, help="default: reporting; with --fit tuning")
-    parser.add_argument("--scenes", type=int, help="so many of each layout; default: 6, with --fit 10")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        help="folder for the record and the curve; by default benchmarks/records and docs/figures, and none "
-        "at all where an option is not the default",
-    )
-    args = parser.parse_args()
-    usual = all(parser.get_default(name) == value for name, value in vars(args).items())
     half = args.half or ("tuning" if args.fit else "reporting")
     count = args.scenes or (10 if args.fit else 6)
-    print(f"{os.cpu_count()} cores, {platform.machine()}, ibi_rs {ibi.__version__}, {half} half", end="")
-    print(f", at most {count} scenes a layout, {PARAMS.hv}")
+    cli.machine(f"{half} half", f"at most {count} scenes a layout", str(PARAMS.hv))
     if args.fit:
         fit(half, count)
         return
     poses = calibrate(half, count)
-    if usual or args.out:
-        write_record((args.out or RECORDS) / "calibration.csv", poses)
-        draw(by_score(poses), (args.out or FIGURES) / "calibration.png")
+    if args.records:
+        columns = [
+            {key: round(v, 4) if isinstance(v, float) else v for key, v in asdict(pose).items()}
+            for pose in poses
+        ]
+        records.write(args.records, "calibration.csv", columns)
+        draw(by_score(poses), args.pictures / "calibration.png")
 
 
 if __name__ == "__main__":

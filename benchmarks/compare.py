@@ -15,154 +15,74 @@ benchmarks/accuracy.py, one to one. A peer that cannot run here is a row that sa
 
 from __future__ import annotations
 
-import argparse
-import csv
-import os
-import platform
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import ibi_rs as ibi
 import numpy as np
-from accuracy import RECORDS, Result, score
-from ibi_rs import metrics, synth
-from layouts import FIRST_SEED, LAYOUTS, scenes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from peers import METHODS, Missing
-from peers.contract import CORES
+from frame import cli, plots, records, runs
+from frame.layouts import LAYOUTS, scenes
+from frame.runs import Outcome
+from frame.tables import show
+from ibi_rs import synth
+from peers import METHODS, available
 from peers.methods import OURS, PAPER_ONLY
 from peers.settings import SETTINGS, SWEEP, settings
 
-FIGURES = Path(__file__).parents[1] / "docs/figures"
-LAYOUTS_RUN = ("outlier-5000", "ecc-0.02", "fpfh")
-WITH_MODELNET = "fpfh-modelnet"
+LAYOUTS_RUN = ("outlier-5000", "ecc-0.02", "fpfh", "fpfh-modelnet")
+COLUMNS = (
+    *("layout", "method", "threads", "version", "scene", "K", "M", "recall", "precision", "f1", "strict_f1"),
+    *("poses", "seconds", "ratio", "repeats", "missing"),
+)
+Outcomes = dict[str, list[Outcome]]
 
 
-@dataclass
-class Run:
-    """One method on one scene.
-
-    Attributes
-    ----------
-    method, version : str
-    result : Result
-        The scores, of the first repeat.
-    seconds : list of float
-        One for each repeat.
-    ratio : float
-        Median over the repeats of the time as a multiple of ours, on one thread.
-    """
-
-    method: str
-    version: str
-    result: Result
-    seconds: list[float] = field(default_factory=list)
-    ratio: float = float("nan")
-
-    @property
-    def median_s(self) -> float:
-        """Median of the repeats."""
-        return float(np.median(self.seconds))
-
-    def row(self, layout: str) -> dict[str, Any]:
-        """Return what the record holds."""
-        one, strict = self.result.one_to_one, self.result.strict
-        return {
-            **empty_row(layout, self.method),
-            "version": self.version,
-            "scene": self.result.scene,
-            "K": one.num_truth,
-            "M": self.result.num_correspondences,
-            **{key: f"{getattr(one, key):.4f}" for key in ("recall", "precision", "f1")},
-            "strict_f1": "" if strict is None else f"{strict.f1:.4f}",
-            "poses": one.num_predicted,
-            "seconds": f"{self.median_s:.5f}",
-            "ratio": f"{self.ratio:.3f}",
-            "repeats": len(self.seconds),
-        }
+def is_symmetric(layout: str) -> bool:
+    """Whether a layout has symmetric shapes."""
+    return LAYOUTS[layout].shapes == "symmetric"
 
 
-def empty_row(layout: str, method: str, missing: str = "") -> dict[str, Any]:
-    """Return the row of a method that did not run."""
-    scores = ("recall", "precision", "f1", "strict_f1")
-    keys = ("scene", "K", "M", *scores, "poses", "seconds", "ratio", "repeats")
-    return {
-        "layout": layout,
-        "method": method,
-        "threads": METHODS[method].threads,
-        "version": "",
-        **dict.fromkeys(keys, ""),
-        "missing": missing,
-    }
+def compare(layout: str, todo: Sequence[synth.Scene], names: Sequence[str], repeats: int) -> Outcomes:
+    """Run methods in turn."""
+    methods = {name: partial(METHODS[name].prepare, settings=settings(name, layout)) for name in names}
+    return runs.run(todo, methods, is_symmetric(layout), repeats)
 
 
-def check(methods: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-    """Versions of the methods that can run, and why the others cannot."""
-    versions, missing = {}, {}
-    for name in methods:
-        try:
-            versions[name] = METHODS[name].module.version()
-        except Missing as reason:
-            missing[name] = str(reason)
-    return versions, missing
+def ratios(outcomes: Outcomes, name: str) -> list[float]:
+    """Return times as multiples of ours on one thread: of each scene the median over the repeats."""
+    if OURS not in outcomes:
+        return [float("nan")] * len(outcomes[name])
+    pairs = zip(outcomes[name], outcomes[OURS], strict=True)
+    return [float(np.median(np.divide(theirs.seconds, ours.seconds))) for theirs, ours in pairs]
 
 
-def compare(
-    layout: str, half: str, todo: Sequence[synth.Scene], versions: dict[str, str], repeats: int
-) -> dict[str, list[Run]]:
-    """Run methods in turn on scene after scene, and all of it again.
-
-    Returns
-    -------
-    dict
-        Of each method its runs, in the order of the scenes.
-    """
-    prepared = {
-        name: [METHODS[name].prepare(scene, settings(name, layout)) for scene in todo] for name in versions
-    }
-    runs: dict[str, list[Run]] = {name: [] for name in versions}
-    for repeat in range(repeats):
-        for i, scene in enumerate(todo):
-            for name, version in versions.items():
-                start = time.perf_counter()
-                poses = prepared[name][i](scene)
-                seconds = time.perf_counter() - start
-                if repeat == 0:
-                    runs[name].append(
-                        Run(name, version, score(scene, poses, layout, half, name, 1e3 * seconds))
-                    )
-                runs[name][i].seconds.append(seconds)
-    if OURS in runs:
-        for i, ours in enumerate(runs[OURS]):
-            for of_method in runs.values():
-                of_method[i].ratio = float(np.median(np.divide(of_method[i].seconds, ours.seconds)))
-    return runs
+def rows(
+    layout: str, outcomes: Outcomes, versions: dict[str, str], missing: dict[str, str]
+) -> list[dict[str, Any]]:
+    """Return what the record holds of a layout."""
+    held = runs.rows(outcomes, layout=layout)
+    for row, ratio in zip(held, chain(*(ratios(outcomes, name) for name in outcomes)), strict=True):
+        row |= {"ratio": f"{ratio:.3f}", "version": versions[row["method"]]}
+    held += [{"layout": layout, "method": name, "missing": reason} for name, reason in missing.items()]
+    return [{**row, "threads": METHODS[row["method"]].threads} for row in held]
 
 
 # Output ---------------------------------------------------------------------------------------------------
 
 
-def print_table(layout: str, half: str, runs: dict[str, list[Run]], missing: dict[str, str]) -> None:
+def print_table(layout: str, half: str, outcomes: Outcomes, missing: dict[str, str]) -> None:
     """Print one layout: a line per method."""
-    first = next(iter(runs.values()))
-    inliers = np.mean([r.result.inlier_share for r in first])
-    m = np.mean([r.result.num_correspondences for r in first])
-    head = f"{layout}, {half} half: {len(first)} scenes, {m:.0f} correspondences, {inliers:.2%} inliers"
-    print(f"\n{head}\n{'method':36s}  MHR    MHP    MHF1   strict poses        ms   x ours")
-    for name, of_method in runs.items():
-        loose = metrics.mean_score(r.result.one_to_one for r in of_method)
-        strict = metrics.mean_score(r.result.strict for r in of_method)
-        poses = sum(r.result.one_to_one.num_predicted for r in of_method)
-        ms = 1e3 * np.median([r.median_s for r in of_method])
-        ratio = np.median([r.ratio for r in of_method])
-        print(
-            f"{name:36s}  {loose.mhr:.3f}  {loose.mhp:.3f}  {loose.mhf1:.3f}  {strict.mhf1:.3f}  {poses:5d} "
-            f"{ms:9.1f}  {ratio:7.2f}",
-            flush=True,
+    first = next(iter(outcomes.values()))
+    inliers, m = np.mean([(o.inlier_share, o.num_correspondences) for o in first], axis=0)
+    title = f"{layout}, {half} half: {len(first)} scenes, {m:.0f} correspondences, {inliers:.2%} inliers"
+    print(f"\n{title}\n{'method':36s}  MHR    MHP    MHF1   strict poses        ms   x ours")
+    for name, of in outcomes.items():
+        loose, strict = runs.mean(of), runs.mean(of, "strict")
+        show(
+            f"{name:36s}  {loose.mhr:.3f}  {loose.mhp:.3f}  {loose.mhf1:.3f}  {strict.mhf1:.3f}  "
+            f"{runs.num_poses(of):5d} {runs.median_ms(of):9.1f}  {np.median(ratios(outcomes, name)):7.2f}"
         )
     for name, reason in missing.items():
         print(f"{name:36s}  missing: {reason}")
@@ -173,28 +93,31 @@ def applies(name: str, layout: str) -> bool:
     return not METHODS[name].needs_normals or layout.startswith("fpfh")
 
 
-def draw(path: Path, by_layout: dict[str, dict[str, list[Run]]]) -> None:
+def draw(path: Path, by_layout: dict[str, Outcomes]) -> None:
     """MHF1 against the time, a panel for each layout."""
-    figure = Figure(figsize=(4.2 * len(by_layout) + 2.6, 4.2), layout="constrained")
-    panels = figure.subplots(1, len(by_layout), sharey=True, squeeze=False)[0]
+    size = (4.2 * len(by_layout) + 2.6, 4.2)
+    figure, panels = plots.panels(size, len(by_layout), sharey=True)
     markers, handles = "os^DvPX<>*ph", {}
-    for panel, (layout, runs) in zip(panels, by_layout.items(), strict=True):
+    for panel, (layout, of) in zip(panels, by_layout.items(), strict=True):
         for i, name in enumerate(METHODS):
-            if name not in runs:
+            if name not in of:
                 continue
-            seconds = np.median([r.median_s for r in runs[name]])
-            mhf1 = metrics.mean_score(r.result.one_to_one for r in runs[name]).mhf1
+            is_ours = name.startswith("ibi")
             (handles[name],) = panel.plot(
-                seconds, mhf1, markers[i % len(markers)], ms=9 if name.startswith("ibi") else 7,
-                color="tab:red" if name.startswith("ibi") else f"C{i}", mec="black", mew=0.6, ls="none",
-            )  # fmt: skip
+                runs.median_ms(of[name]) / 1e3,
+                runs.mean(of[name]).mhf1,
+                markers[i % len(markers)],
+                ms=9 if is_ours else 7,
+                color="tab:red" if is_ours else f"C{i}",
+                mec="black",
+                mew=0.6,
+                ls="none",
+            )
         panel.set(title=layout, xlabel="seconds a scene (median)", xscale="log", ylim=(-0.03, 1.03))
         panel.grid(alpha=0.3, which="both")
     panels[0].set_ylabel("MHF1, one to one")
     figure.legend(handles.values(), handles, loc="outside right center", fontsize=8)
-    FigureCanvasAgg(figure)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    plots.save(figure, path, 110)
     print(f"\nwrote {path.name}")
 
 
@@ -213,16 +136,9 @@ def tune(layout: str, todo: Sequence[synth.Scene], name: str) -> None:
         """Score the settings: the least is the best, so scores have their signs turned."""
         key = tuple(values.items())
         if key not in tried:
-            results = []
-            for scene in todo:
-                register = METHODS[name].prepare(scene, values)
-                start = time.perf_counter()
-                poses = register(scene)
-                ms = 1e3 * (time.perf_counter() - start)
-                results.append(score(scene, poses, layout, "tuning", name, ms))
-            loose = metrics.mean_score(r.one_to_one for r in results).mhf1
-            strict = metrics.mean_score(r.strict for r in results).mhf1
-            ms = float(np.median([r.ms for r in results]))
+            prepare = partial(METHODS[name].prepare, settings=values)
+            ((_, of),) = runs.run(todo, {name: prepare}, is_symmetric(layout)).items()
+            loose, strict, ms = runs.mean(of).mhf1, runs.mean(of, "strict").mhf1, runs.median_ms(of)
             tried[key] = -round(loose, 3), round(np.log(ms) / np.log(1.1)), -strict, ms
         return tried[key]
 
@@ -236,39 +152,24 @@ def tune(layout: str, todo: Sequence[synth.Scene], name: str) -> None:
 
 def main() -> None:
     """Run, print, record, draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    args = cli.parse(
+        __doc__,
+        cli.HALF,
+        cli.LAYOUT,
+        cli.several("--method", METHODS),
+        cli.scenes(10),
+        cli.repeats(3),
+        cli.MODELNET,
+        cli.flag("--tune", "sweep the settings of the peers on the tuning half"),
+        cli.out("repeats", "modelnet", "tune"),
     )
-    parser.add_argument("--half", choices=FIRST_SEED, default="reporting")
-    parser.add_argument("--layout", nargs="+", choices=LAYOUTS, metavar="NAME", help=", ".join(LAYOUTS_RUN))
-    parser.add_argument("--method", nargs="+", choices=METHODS, metavar="NAME", help="; ".join(METHODS))
-    parser.add_argument("--scenes", type=int, default=10, help="of each layout")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument(
-        "--modelnet", type=Path, help=f"npz file: category/name -> (n, 3); adds {WITH_MODELNET}"
-    )
-    parser.add_argument(
-        "--tune", action="store_true", help="sweep the settings of the peers on the tuning half"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        help="folder for record and plot; by default benchmarks/records and docs/figures, and none at all "
-        "where the other options are not the default",
-    )
-    args = parser.parse_args()
-    usual = all(
-        getattr(args, key) == parser.get_default(key) for key in ("half", "layout", "method", "scenes")
-    )
-    chosen = args.layout or [*LAYOUTS_RUN, *([WITH_MODELNET] if args.modelnet else [])]
-    if args.modelnet is None and any(LAYOUTS[name].shapes == "modelnet" for name in chosen):
-        parser.error("ModelNet layouts need --modelnet")
-    versions, missing = check(args.method or [name for name in METHODS if name not in PAPER_ONLY])
-    print(f"{CORES} of {os.cpu_count()} cores, {platform.machine()}, ibi_rs {ibi.__version__}")
+    chosen = cli.layouts(args, LAYOUTS_RUN)
+    versions, missing = available(args.method or [name for name in METHODS if name not in PAPER_ONLY])
+    cli.machine()
     for name, reason in missing.items():
         print(f"missing: {name}: {reason}")
 
-    by_layout, rows = {}, []
+    by_layout, record = {}, []
     for layout in chosen:
         todo = list(scenes(layout, "tuning" if args.tune else args.half, args.scenes, args.modelnet))
         if args.tune:
@@ -276,20 +177,13 @@ def main() -> None:
                 if name in SETTINGS:
                     tune(layout, todo, name)
             continue
-        here = {name: version for name, version in versions.items() if applies(name, layout)}
-        runs = by_layout[layout] = compare(layout, args.half, todo, here, args.repeats)
-        print_table(layout, args.half, runs, missing)
-        rows += [run.row(layout) for of_method in runs.values() for run in of_method]
-        rows += [empty_row(layout, name, reason) for name, reason in missing.items()]
-    if args.tune or not (args.out or usual):
-        return
-    record = (args.out or RECORDS) / "peers.csv"
-    record.parent.mkdir(parents=True, exist_ok=True)
-    with record.open("w", newline="", encoding="utf-8") as file:
-        out = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        out.writeheader()
-        out.writerows(rows)
-    draw((args.out or FIGURES) / "peers.png", by_layout)
+        here = [name for name in versions if applies(name, layout)]
+        by_layout[layout] = compare(layout, todo, here, args.repeats)
+        print_table(layout, args.half, by_layout[layout], missing)
+        record += rows(layout, by_layout[layout], versions, missing)
+    if args.records and not args.tune:
+        records.write(args.records, "peers.csv", record, COLUMNS)
+        draw(args.pictures / "peers.png", by_layout)
 
 
 if __name__ == "__main__":

@@ -12,111 +12,70 @@ registration.
 
 from __future__ import annotations
 
-import argparse
-import csv
-import os
-import re
-import time
-from pathlib import Path
+from collections.abc import Iterable
 
 import ibi_rs as ibi
-import numpy as np
+from frame import cli, records, tables
+from frame.records import Row
+from frame.scans import SCANS, Case, detect, real
+from frame.timing import CORES
 from ibi_rs import metrics
-from peers.contract import CORES
-from scans import EXAMPLES, SCANS, labels
 
-ROOT = Path(__file__).parents[1]
-RECORD = ROOT / "benchmarks/records/detect.csv"
-PAGE = ROOT / "docs/features.md"
-
-
-def folders(root: Path | None) -> dict[str, Path]:
-    """Where each scan is that can be had."""
-    return {
-        name: root / scan.folder if root else EXAMPLES / str(scan.shipped)
-        for name, scan in SCANS.items()
-        if root or scan.shipped
-    }
+PAGE = records.DOCS / "features.md"
+RECORD = "detect.csv"
+HEAD = (
+    *("scan", "points", "correspondences", "labels reached", "turned by, deg", "poses", "precision"),
+    *("model s", "match s", "all s"),
+)
 
 
-def run(name: str, folder: Path, repeats: int) -> dict[str, object]:
+def run(case: Case, repeats: int) -> Row:
     """Detect the parts of one scan."""
-    mesh = ibi.io.read_mesh(folder / SCANS[name].mesh)
-    scan, _ = ibi.io.read_cloud(folder / f"{SCANS[name].file or name}.ply")
-    truth = labels(folder, name)
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        model = ibi.Model.from_mesh(*mesh)
-        made = time.perf_counter()
-        matches = model.correspond(scan, viewpoint=[0, 0, 0])
-        matched = time.perf_counter()
-        found = model.detect(scan, viewpoint=[0, 0, 0])
-        detected = time.perf_counter() - matched
-        seconds.append((made - start, matched - made, detected))
-    symmetries = SCANS[name].symmetries
+    done = detect(case, repeats)
     score = metrics.score_scene(
-        found, truth, criterion=metrics.ADD_S, model=model.points, symmetries=symmetries
+        done.found,
+        case.poses,
+        criterion=metrics.ADD_S,
+        model=done.model.points,
+        symmetries=SCANS[case.name].symmetries,
     )
     turned = [match.rotation_error_deg for match in score.matches if match is not None and match.is_hit]
-    of_model, of_match, of_all = np.median(seconds, axis=0)
     return {
-        "scan": name,
-        "points": len(scan),
-        "correspondences": len(matches.corr),
-        "labels": len(truth),
-        "reached": score.num_truth_hit,
-        "poses": len(found),
-        "precision": f"{score.precision:.3f}" if SCANS[name].is_complete else "",
+        "scan": case.name,
+        "points": str(len(case.points)),
+        "correspondences": str(len(done.matches.corr)),
+        "labels": str(len(case.poses)),
+        "reached": str(score.num_truth_hit),
+        "poses": str(len(done.found)),
+        "precision": f"{score.precision:.3f}" if case.is_complete else "",
         "turned_deg": f"{max(turned):.1f}" if turned else "",
-        "model_s": f"{of_model:.3f}",
-        "match_s": f"{of_match:.3f}",
-        "detect_s": f"{of_all:.3f}",
+        "model_s": f"{done.model_s:.3f}",
+        "match_s": f"{done.match_s:.3f}",
+        "detect_s": f"{done.detect_s:.3f}",
         "version": ibi.__version__,
-        "cores": CORES,
+        "cores": str(CORES),
     }
 
 
-def markdown(rows: list[dict[str, str]]) -> str:
+def markdown(rows: Iterable[Row]) -> str:
     """Return the table of the page, from what the record holds."""
-    lines = [
-        "| scan | points | correspondences | labels reached | turned by, deg | poses | precision | model s "
-        "| match s | all s |",
-        f"|{'---|' * 10}",
-    ]
+    lines = []
     for row in rows:
-        reached = f"{row['reached']} of {row['labels']}"
-        cells = [row["scan"], row["points"], row["correspondences"], reached, row["turned_deg"]]
-        cells += [row["poses"], row["precision"]]
-        cells += [f"{float(row[key]):.2f}" for key in ("model_s", "match_s", "detect_s")]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        cells = [row["scan"], row["points"], row["correspondences"], f"{row['reached']} of {row['labels']}"]
+        cells += [row[key] for key in ("turned_deg", "poses", "precision")]
+        lines.append(cells + [f"{float(row[key]):.2f}" for key in ("model_s", "match_s", "detect_s")])
+    return tables.markdown(HEAD, lines)
 
 
 def main() -> None:
     """Run, print, record."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument(
-        "--docs", action="store_true", help="write the record and the table of docs/features.md"
-    )
-    arguments = parser.parse_args()
-    root = Path(os.environ["IBI_DATA"]) if "IBI_DATA" in os.environ else None
-    rows = [
-        {key: str(value) for key, value in run(name, folder, arguments.repeats).items()}
-        for name, folder in folders(root).items()
-    ]
+    docs = cli.flag("--docs", "write the record and the table of docs/features.md")
+    args = cli.parse(__doc__, cli.repeats(3), docs)
+    rows = [run(case, args.repeats) for case in real()]
     print(markdown(rows))
-    if arguments.docs:
-        with RECORD.open("w", newline="", encoding="utf-8") as file:
-            out = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            out.writeheader()
-            out.writerows(rows)
-        page = PAGE.read_text(encoding="utf-8")
-        table = f"<!-- detect -->\n{markdown(rows)}\n<!-- end -->"
-        PAGE.write_text(re.sub(r"<!-- detect -->.*?<!-- end -->", lambda _: table, page, flags=re.DOTALL))
+    if args.docs:
+        records.write(records.RECORDS, RECORD, rows)
+        records.fill(PAGE, {"detect": markdown(rows)})
 
 
 if __name__ == "__main__":

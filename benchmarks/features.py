@@ -9,23 +9,21 @@ which is exact, too, and the product of matrices.
 
 from __future__ import annotations
 
-import argparse
-import csv
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import ibi_rs as ibi
 import numpy as np
 import open3d as o3d
+from frame import cli, records
+from frame.tables import head, line, show
+from frame.timing import in_turn
 from ibi_rs import features
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-ROOT = Path(__file__).parents[1]
-RECORD = ROOT / "benchmarks/records/features.csv"
 OFF = 1e-3
 """FPFH counts as equal up to this; a histogram has a sum of 200."""
 
@@ -108,6 +106,19 @@ def fpfh_task(
     )
 
 
+def match_task(
+    data: str,
+    model: NDArray[np.float32],
+    scene: NDArray[np.float32],
+    k: int,
+    other: str,
+    search: Callable[[], NDArray[np.int64]] | None = None,
+) -> Task:
+    """Find the nearest descriptors; the other's search is by products of matrices unless it is given."""
+    theirs = search or partial(by_matrices, model, scene, k)
+    return Task("match", data, partial(ibi.match, model, scene, k=k), other, theirs, equal_rows)
+
+
 def tasks() -> Iterator[Task]:
     """Make the rows, one after the other."""
     points, normals = sheet_and_ball(30_000)
@@ -115,17 +126,18 @@ def tasks() -> Iterator[Task]:
     yield fpfh_task(data, points, normals, 0.045, 100)
     yield fpfh_task(data, points, normals, 0.07, 150)
     yield fpfh_task(data, points, normals, 0.1, 100)
-    with np.load(ROOT / "examples/tee/tee6.npz") as file:
+    with np.load(records.ROOT / "examples/tee/tee6.npz") as file:
         scan = {name: file[name].astype(np.float64) for name in ("src", "tgt", "src_normals", "tgt_normals")}
         voxel = float(file["voxel"])
     size = f"scan tee6, {len(scan['tgt'])} points"
     yield fpfh_task(size, scan["tgt"], scan["tgt_normals"], 6 * voxel, 150)
 
+    cloud = in_open3d(points)
+
     def open3d_normals() -> Any:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.045, 30))
         return cloud
 
-    cloud = in_open3d(points)
     yield Task(
         "normals",
         f"{data}, at most 30 around",
@@ -144,79 +156,33 @@ def tasks() -> Iterator[Task]:
         lambda: dense.voxel_down_sample(0.02),
         lambda ours, theirs: f"{len(ours)} and {len(theirs.points)} points",
     )
-    described = features.fpfh(points, normals, 0.07, 150)
-    k = 2
+    described, k = features.fpfh(points, normals, 0.07, 150), 2
     for count in (2000, 5000):
         model = features.fpfh(*sheet_and_ball(count), 0.15, 150)
         pair = f"FPFH, {count} x 30000, k {k}"
-        tree = cKDTree(model.astype(np.float64))
-        yield Task(
-            "match",
-            pair,
-            lambda model=model: ibi.match(model, described, k=k),  # type: ignore[misc]
-            "scipy kd-tree",
-            lambda tree=tree: tree.query(described, k=k, workers=-1)[1],  # type: ignore[misc]
-            equal_rows,
-        )
-        yield Task(
-            "match",
-            pair,
-            lambda model=model: ibi.match(model, described, k=k),  # type: ignore[misc]
-            "numpy",
-            lambda model=model: by_matrices(model, described, k),  # type: ignore[misc]
-            equal_rows,
-        )
+        search = partial(cKDTree(model.astype(np.float64)).query, described, k=k, workers=-1)
+        yield match_task(pair, model, described, k, "scipy kd-tree", lambda search=search: search()[1])
+        yield match_task(pair, model, described, k, "numpy")
     rng = np.random.default_rng(0)
-    learned, queries = rng.normal(size=(2000, 256)), rng.normal(size=(6000, 256))
-    learned, queries = learned.astype(np.float32), queries.astype(np.float32)
-    yield Task(
-        "match",
-        "random, 256 numbers, 2000 x 6000, k 2",
-        lambda: ibi.match(learned, queries, k=k),
-        "numpy",
-        lambda: by_matrices(learned, queries, k),
-        equal_rows,
-    )
-
-
-def timed(job: Callable[[], Any]) -> tuple[float, Any]:
-    """Run a job on the clock."""
-    start = time.perf_counter()
-    result = job()
-    return time.perf_counter() - start, result
+    learned, queries = (rng.normal(size=(rows, 256)).astype(np.float32) for rows in (2000, 6000))
+    yield match_task("random, 256 numbers, 2000 x 6000, k 2", learned, queries, k, "numpy")
 
 
 def main() -> None:
     """Print the table line by line, as Markdown, and write the record."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--repeats", type=int, default=7, help="runs of each, after one to warm up (default 7)"
-    )
-    repeats = parser.parse_args().repeats
+    args = cli.parse(__doc__, cli.repeats(7))
     heads = ("what", "data", "ours ms", "other", "other ms", "times as fast", "difference")
-    print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}", flush=True)
+    show(head(heads))
     record = []
     for task in tasks():
-        difference = task.difference(timed(task.ours)[1], timed(task.theirs)[1])
-        runs = np.array([[timed(task.ours)[0], timed(task.theirs)[0]] for _ in range(repeats)])
-        ours, theirs = 1e3 * np.median(runs, axis=0)
-        cells = (
-            task.name,
-            task.data,
-            f"{ours:.1f}",
-            task.other,
-            f"{theirs:.1f}",
-            f"{np.median(runs[:, 1] / runs[:, 0]):.1f}",
-            difference,
-        )
-        print(f"| {' | '.join(cells)} |", flush=True)
+        difference = task.difference(task.ours(), task.theirs())  # and both are warm
+        seconds = in_turn([task.ours, task.theirs], args.repeats)
+        ours, theirs = (f"{ms:.1f}" for ms in 1e3 * np.median(seconds, axis=0))
+        ratio = f"{np.median(seconds[:, 1] / seconds[:, 0]):.1f}"
+        cells = (task.name, task.data, ours, task.other, theirs, ratio, difference)
+        show(line(cells))
         record.append({"version": ibi.__version__, **dict(zip(heads, cells, strict=True))})
-    with RECORD.open("w", newline="", encoding="utf-8") as file:
-        out = csv.DictWriter(file, list(record[0]), lineterminator="\n")
-        out.writeheader()
-        out.writerows(record)
+    records.write(records.RECORDS, "features.csv", record)
 
 
 if __name__ == "__main__":

@@ -14,13 +14,13 @@ nearest points of two samples such shapes are one.
 
 from __future__ import annotations
 
-import argparse
-import json
 from concurrent.futures import ProcessPoolExecutor
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from frame import cli
+from frame.layouts import index, write_index
 from ibi_rs import synth
 from scipy.spatial import cKDTree
 from symmetry import alignments
@@ -54,27 +54,20 @@ def deviation(pair: tuple[Shape, Shape]) -> float:
 
 def main() -> None:
     """Run over a folder."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path, help="folder of PLY meshes with their index.json")
-    folder = parser.parse_args().folder
-    index = folder / "index.json"
-    entries = json.loads(index.read_text(encoding="utf-8"))
+    folder = cli.parse(__doc__, cli.option("folder", type=Path, help="of PLY meshes with index.json")).folder
+    entries = index(folder)
     shapes = {entry["file"]: Shape(folder / entry["file"]) for entry in entries}
     pairs = [(a["file"], b["file"]) for a, b in combinations(entries, 2) if a["symmetric"] == b["symmetric"]]
     with ProcessPoolExecutor() as pool:
         values = list(pool.map(deviation, [(shapes[a], shapes[b]) for a, b in pairs], chunksize=8))
-    like: dict[str, list[str]] = {file: [] for file in shapes}
+    like: dict[str, set[str]] = {file: set() for file in shapes}
     for value, (a, b) in sorted(zip(values, pairs, strict=True)):
         if value < THRESHOLD:
-            like[a].append(b)
-            like[b].append(a)
+            like[a].add(b)
+            like[b].add(a)
         if value < 1.25 * THRESHOLD:
             print(f"{a:28s} {b:28s} {value:.3f} radii {'near-copies' * (value < THRESHOLD)}")
-    for entry in entries:
-        entry["like"] = sorted(like[entry["file"]])
-    index.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+    write_index(folder, "like", {file: sorted(others) for file, others in like.items()})
 
 
 if __name__ == "__main__":

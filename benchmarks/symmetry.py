@@ -13,14 +13,15 @@ for more: each point has to find its place, not their mean, and the motions have
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import ibi_rs as ibi
 import numpy as np
+from frame import cli
+from frame.layouts import write_index
+from frame.tables import show
+from frame.timing import timed
 from ibi_rs import synth
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -68,35 +69,21 @@ def fit(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def main() -> None:
     """Run over a folder."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "folder", type=Path, nargs="?", help="folder of PLY meshes; default: the built-in shapes"
-    )
-    folder = parser.parse_args().folder
+    what = "folder of PLY meshes; default: the built-in shapes"
+    folder = cli.parse(__doc__, cli.option("folder", type=Path, nargs="?", help=what)).folder
+    sample = synth.sample_mesh if folder else synth.shape
     paths = sorted(folder.glob("*.ply")) if folder else []
-    clouds = {path.name: synth.sample_mesh(path, 3400, np.random.default_rng(0))[0] for path in paths}
-    if not folder:
-        clouds = {name: synth.shape(name, 3400, np.random.default_rng(0))[0] for name in synth.SHAPES}
+    named = [(path.name, path) for path in paths] if folder else [(name, name) for name in synth.SHAPES]
     symmetric = {}
-    for name, points in clouds.items():
+    for name, shape in named:
+        points = sample(shape, 3400, np.random.default_rng(0))[0]
         value, angle = deviation(points)
         symmetric[name] = value < THRESHOLD
-        start = time.perf_counter()
-        group = ibi.find_symmetries(points)
-        seconds = time.perf_counter() - start
-        print(
-            f"{name:28s} {value:.3f} radii at {angle:3.0f} degrees {'symmetric' * symmetric[name]:9s}"
-            f"  {group} in {seconds:.2f} s",
-            flush=True,
-        )
+        seconds, group = timed(ibi.find_symmetries, points)
+        found = f"{value:.3f} radii at {angle:3.0f} degrees {'symmetric' * symmetric[name]:9s}"
+        show(f"{name:28s} {found}  {group} in {seconds:.2f} s")
     if folder:
-        index = folder / "index.json"
-        entries = json.loads(index.read_text(encoding="utf-8"))
-        for entry in entries:
-            entry["symmetric"] = symmetric[entry["file"]]
-        index.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+        write_index(folder, "symmetric", symmetric)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """`Model.from_mesh` and `Model.detect`: from a mesh and a scan to poses, and what they refuse."""
 
-import csv
 import pickle
 import sys
 from pathlib import Path
@@ -144,7 +143,7 @@ def test_the_page_has_the_figures_of_the_record():
     root = Path(__file__).parents[1]
     sys.path.insert(0, str(root / "benchmarks"))
     from detect import RECORD, markdown
+    from frame import records
 
-    with RECORD.open(newline="", encoding="utf-8") as file:
-        table = markdown(list(csv.DictReader(file)))
+    table = markdown(records.read(records.RECORDS / RECORD))
     assert table in (root / "docs/features.md").read_text(encoding="utf-8"), "run benchmarks/detect.py --docs"

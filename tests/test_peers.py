@@ -18,6 +18,7 @@ sys.path.insert(0, str(BENCHMARKS))
 import paper_loop  # noqa: E402
 import paper_rows  # noqa: E402
 import paper_tables  # noqa: E402
+from frame import records  # noqa: E402
 from peers import METHODS, consac, ecc, pcl, pointclm, progx, tlinkage, triplets  # noqa: E402
 from peers.contract import Missing, model_spacing  # noqa: E402
 from peers.methods import LEARNED  # noqa: E402
@@ -395,14 +396,13 @@ def test_every_row_of_the_tables_can_be_made():
             for row in rows:
                 assert row.missing or (row.params is None) != (row.peer is None)
                 assert row.peer is None or row.peer in METHODS
-            kinds = paper_tables.CITED.get(name, {})
-            of_data = kinds.get(data, kinds.get("real" if paper_rows.is_real(data) else "synthetic", {}))
-            assert set(of_data) <= {row.name for row in rows}
+            assert set(paper_rows.cited(name, data)) <= {row.name for row in rows}
 
 
 def test_the_page_has_the_figures_of_the_record():
     page = paper_tables.PAGE.read_text(encoding="utf-8")
-    held = paper_tables.read_record(paper_tables.RECORDS / paper_tables.RECORD)
-    assert paper_tables.write_page(page, held) == page, "run benchmarks/paper_tables.py --docs"
+    held = records.read(records.RECORDS / paper_tables.RECORD)
+    tables = paper_tables.page_tables(held)
+    assert records.filled(page, tables) == page, "run benchmarks/paper_tables.py --docs"
     places = set(re.findall(r"<!-- begin ([^,]+), (.+?) -->", page))
     assert places == {paper_tables.block(row) for row in held}

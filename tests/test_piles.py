@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import piles  # noqa: E402
+from frame import records  # noqa: E402
 
 MESH = ibi.io.read_mesh(ROOT / "examples/models/cat.ply")
 SIZE = np.linalg.norm(np.ptp(MESH[0], axis=0))
@@ -184,23 +185,27 @@ def test_a_pose_of_a_hidden_instance_is_neither_right_nor_wrong():
     assert (score.recall, score.num_predicted, ignored) == (0.0, 0, 0)
 
 
+def recorded():
+    return records.read(records.RECORDS / piles.RECORD)
+
+
 def test_the_page_has_the_figures_of_the_record():
-    page, rows = (ROOT / "docs/features.md").read_text(encoding="utf-8"), piles.read()
+    page, rows = (ROOT / "docs/features.md").read_text(encoding="utf-8"), recorded()
     for table in (piles.shape_table(rows), piles.peer_table(rows)):
         assert table in page, "run benchmarks/piles.py --docs"
 
 
 def test_a_missing_peer_is_a_row_that_says_so():
-    rows = [row for row in piles.read() if row["name"] in ("koala", "two") and row["method"] == piles.OURS]
+    rows = [row for row in recorded() if row["name"] in ("koala", "two") and row["method"] == piles.OURS]
     cases = [piles.Case(row["data"], row["name"], None, MESH, *3 * [np.empty(0)]) for row in rows[-1:]]
-    rows += [piles.missing_row(cases[0], name, "no driver") for name in piles.PEERS]
+    rows += [piles.row(cases[0], name, missing="no driver") for name in piles.PEERS]
     assert "| PCL GC + check | missing: no driver |" in piles.peer_table(rows)
 
 
 def test_no_shape_without_symmetry_is_left_out_of_the_record():
-    recorded = {row["name"] for row in piles.read() if row["data"] == "pile"}
-    assert recorded >= set(piles.shapes(piles.MODELS))
-    assert len(recorded) >= 8
+    names = {row["name"] for row in recorded() if row["data"] == "pile"}
+    assert names >= set(piles.shapes(piles.MODELS))
+    assert len(names) >= 8
 
 
 @needs_open3d

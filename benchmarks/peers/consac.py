@@ -41,7 +41,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     checkpoint : str or None
     inlier_pr : float
         Largest residual of an inlier.
@@ -49,10 +48,6 @@ def prepare(
         At most so many instances, each the best of so many triplets.
     least : int
         Ends with an instance that adds fewer correspondences.
-
-    Returns
-    -------
-    callable
     """
     network = weights.load(weights.find("CONSAC", VARIABLE, checkpoint))
     gamma = inlier_pr * model_spacing(scene.src)

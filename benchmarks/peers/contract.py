@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
-import numpy as np
+from frame.runs import Register
+from frame.runs import spacing as model_spacing
+from frame.timing import CORES
 from ibi_rs import synth
-from numpy.typing import NDArray
 
-Register = Callable[[synth.Scene], NDArray[np.float64]]
-"""Gives the poses found in a scene, (K, 4, 4), best first."""
-
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-"""What a peer that takes all cores can get."""
+__all__ = ["CORES", "Method", "Missing", "Register", "model_spacing"]
 
 
 class Missing(Exception):
@@ -47,10 +42,3 @@ class Method:
         """Prepare for the model of a scene."""
         register: Register = self.module.prepare(scene, **{**settings, **(self.fixed or {})})
         return register
-
-
-def model_spacing(points: NDArray[np.float64]) -> float:
-    """Mean distance to the nearest other point: the pr that settings are multiples of."""
-    from scipy.spatial import cKDTree
-
-    return float(np.mean(cKDTree(points).query(points, k=2)[0][:, 1]))

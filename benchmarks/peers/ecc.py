@@ -40,7 +40,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     samples : int
         So many correspondences, drawn at random, are clustered.
     consistency, reach : float
@@ -53,10 +52,6 @@ def prepare(
         Of two models whose inliers overlap more than this, the earlier is dropped.
     min_members, t_count : int, float
         A pose has at least so many correspondences, and at least this share of the first pose's.
-
-    Returns
-    -------
-    callable
     """
     del scene
 
@@ -213,6 +208,18 @@ def fit(src: Array, tgt: Array, label: NDArray[np.int64], number: int) -> Array:
     poses[:, :3, :3] = u @ vt
     poses[:, :3, 3] = q_mean - np.einsum("kij,kj->ki", poses[:, :3, :3], p_mean)
     return poses
+
+
+def fit_groups(src: Array, tgt: Array, label: NDArray[np.int64], least: int) -> Array:
+    """Fit a pose to each label of at least so many pairs, the largest group first, (K, 4, 4)."""
+    count = np.bincount(label[label >= 0], minlength=1)
+    kept = np.flatnonzero(count >= least)
+    kept = kept[np.argsort(-count[kept], kind="stable")]
+    if not len(kept):
+        return np.empty((0, 4, 4))
+    number = np.full(len(count), -1)
+    number[kept] = np.arange(len(kept))
+    return fit(src, tgt, np.where(label >= 0, number[label], -1), len(kept))
 
 
 def residuals(models: Array, src: Array, tgt: Array) -> Array:

@@ -34,7 +34,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     noise_pr : float
         Noise bound of the pruning.
     solver_gain : float
@@ -43,10 +42,6 @@ def prepare(
         Correspondences this near to a pose are removed.
     least, failures
         As in `in_sequence`.
-
-    Returns
-    -------
-    callable
     """
     import kiss_matcher
 

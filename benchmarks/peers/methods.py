@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import ibi_rs as ibi
-from layouts import NO_NORMALS
+from collections.abc import Iterable
 
-from . import consac, ecc, kiss, open3d_ransac, opencv_ppf, ours, pcl, pointclm, progx, tlinkage
-from .contract import CORES, Method
+import ibi_rs as ibi
+from frame import ours
+from frame.layouts import NO_NORMALS
+
+from . import consac, ecc, kiss, open3d_ransac, opencv_ppf, pcl, pointclm, progx, tlinkage
+from .contract import CORES, Method, Missing
 
 
 def _ours(params: ibi.Params, num_threads: int, *, needs_normals: bool = False) -> Method:
@@ -42,3 +45,14 @@ PAPER_ONLY = ("T-Linkage", "Progressive-X", "CONSAC", "PointCLM")
 
 LEARNED = ("CONSAC", "PointCLM")
 """Need weights and have their defaults for settings: there is nothing to choose them with."""
+
+
+def available(names: Iterable[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the versions of the methods that can run, and why the others cannot."""
+    versions, missing = {}, {}
+    for name in names:
+        try:
+            versions[name] = METHODS[name].module.version()
+        except Missing as reason:
+            missing[name] = str(reason)
+    return versions, missing

@@ -36,7 +36,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     inlier_pr : float
         Inlier distance.
     iterations : int
@@ -47,10 +46,6 @@ def prepare(
         Samples whose edges' lengths are less alike than this are skipped; None: all are tried.
     least, failures
         As in `in_sequence`.
-
-    Returns
-    -------
-    callable
     """
     o3d = load_open3d()
     registration = o3d.pipelines.registration

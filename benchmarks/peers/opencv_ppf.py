@@ -12,7 +12,7 @@ from ibi_rs import synth
 from numpy.typing import NDArray
 
 from .contract import Missing, Register, model_spacing
-from .overlap import Claims, keep_best
+from .overlap import checked
 
 
 def version() -> str:
@@ -40,7 +40,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     model_step, scene_step : float
         Sampling of the model and of the scene, relative to the model's diameter.
     every : int
@@ -51,10 +50,6 @@ def prepare(
         So many poses, those with most votes, are taken.
     least : float or None
         Threshold of the overlap check; None: OpenCV's poses as they are.
-
-    Returns
-    -------
-    callable
     """
     import cv2
 
@@ -72,6 +67,6 @@ def prepare(
         found = detector.match(with_normals(scene.tgt, scene.tgt_normals), 1 / every, scene_step)
         found = sorted(found, key=lambda pose: -pose.numVotes)[:candidates]
         poses = np.array([pose.pose for pose in found]).reshape(-1, 4, 4)
-        return poses if least is None else keep_best(poses, Claims(scene.src, scene.tgt, 1.5 * pr), least)
+        return checked(poses, scene, pr, least)
 
     return register

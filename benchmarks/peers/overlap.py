@@ -7,6 +7,7 @@ peers leave the choice to their users, so it is made here, in the same way for a
 from __future__ import annotations
 
 import numpy as np
+from ibi_rs import synth
 from ibi_rs.synth.scene import move
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -60,3 +61,10 @@ def keep_best(poses: NDArray[np.float64], claims: Claims, least: float) -> NDArr
     """Go through candidates, best first, and return those that `Claims.keep` keeps."""
     kept = [pose for pose in poses[claims.plausible(poses, least)] if claims.keep(pose, least)]
     return np.array(kept).reshape(-1, 4, 4)
+
+
+def checked(
+    poses: NDArray[np.float64], scene: synth.Scene, pr: float, least: float | None
+) -> NDArray[np.float64]:
+    """Return the candidates that stand the check; without a threshold all of them."""
+    return poses if least is None else keep_best(poses, Claims(scene.src, scene.tgt, 1.5 * pr), least)

@@ -20,7 +20,7 @@ from ibi_rs import synth
 from numpy.typing import NDArray
 
 from .contract import Missing, Register, model_spacing
-from .overlap import Claims, keep_best
+from .overlap import checked
 
 LIBRARY = Path(__file__).parent / "_pcl.so"
 CAPACITY = 4096  # poses; a grouping gives tens to hundreds
@@ -63,7 +63,6 @@ def prepare_gc(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     size_pr : float
         Two correspondences agree if their lengths differ by at most this; also the inlier distance of the
         RANSAC that PCL runs in each group.
@@ -73,10 +72,6 @@ def prepare_gc(
         Fit the pose to the whole group. PCL's own is that of the best three correspondences.
     least : float or None
         Threshold of the overlap check; None: PCL's poses as they are.
-
-    Returns
-    -------
-    callable
     """
     library, pr = _library(), model_spacing(scene.src)
 
@@ -89,7 +84,7 @@ def prepare_gc(
             src.ctypes.data, len(src), tgt.ctypes.data, len(tgt), corr.ctypes.data, distance.ctypes.data,
             len(corr), size_pr * pr, threshold, refit, CAPACITY, poses.ctypes.data, counts.ctypes.data,
         )  # fmt: skip
-        return _chosen(scene, number, poses, counts, 1.5 * pr, least)
+        return checked(_best_first(number, poses, counts), scene, pr, least)
 
     return register
 
@@ -124,7 +119,6 @@ def prepare_hough(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     bin_pr : float
         Width of a bin; also the inlier distance of the RANSAC in each bin.
     threshold : float
@@ -135,10 +129,6 @@ def prepare_hough(
         Of PCL's normal estimation, where the scene has no normals.
     refit, least
         As in `prepare_gc`.
-
-    Returns
-    -------
-    callable
     """
     library, pr = _library(), model_spacing(scene.src)
     model = _HoughModel(scene, frame_pr * pr, neighbors)
@@ -150,23 +140,15 @@ def prepare_hough(
             model.handle, tgt.ctypes.data, _address(normals), len(tgt), corr.ctypes.data, len(corr),
             bin_pr * pr, threshold, refit, CAPACITY, poses.ctypes.data, counts.ctypes.data,
         )  # fmt: skip
-        return _chosen(scene, number, poses, counts, 1.5 * pr, least)
+        return checked(_best_first(number, poses, counts), scene, pr, least)
 
     return register
 
 
-def _chosen(
-    scene: synth.Scene,
-    number: int,
-    poses: NDArray[np.float64],
-    counts: NDArray[np.int32],
-    radius: float,
-    least: float | None,
-) -> NDArray[np.float64]:
+def _best_first(number: int, poses: NDArray[np.float64], counts: NDArray[np.int32]) -> NDArray[np.float64]:
     if number < 0:
         raise RuntimeError("PCL raised an exception")
-    poses = poses[:number][np.argsort(-counts[:number], kind="stable")]
-    return poses if least is None else keep_best(poses, Claims(scene.src, scene.tgt, radius), least)
+    return poses[:number][np.argsort(-counts[:number], kind="stable")]
 
 
 def _float(values: NDArray[Any]) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from . import checkpoint as weights
 from .contract import Register, model_spacing
-from .ecc import fit
+from .ecc import fit_groups
 
 Array = NDArray[np.float64]
 VARIABLE = "IBI_POINTCLM_CHECKPOINT"
@@ -44,7 +44,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     checkpoint : str or None
     inlier_pr : float
         Two correspondences agree if their lengths differ by at most this.
@@ -54,10 +53,6 @@ def prepare(
         A correspondence with fewer that are alike and agree is an outlier, a smaller group no instance.
     samples : int
         So many correspondences, drawn at random, take part: the matrix of all pairs grows with their square.
-
-    Returns
-    -------
-    callable
     """
     network = weights.load(weights.find("PointCLM", VARIABLE, checkpoint))
     inlier = inlier_pr * model_spacing(scene.src)
@@ -78,11 +73,4 @@ def groups(features: Array, src: Array, tgt: Array, inlier: float, t_alike: floa
     stays = joined.sum(axis=1) > least
     joined &= stays & stays[:, None]
     _, label = connected_components(csr_matrix(joined), directed=False)
-    count = np.bincount(label[stays], minlength=1)
-    kept = np.flatnonzero(count >= max(least, 3))
-    kept = kept[np.argsort(-count[kept], kind="stable")]
-    if not len(kept):
-        return np.empty((0, 4, 4))
-    number = np.full(label.max() + 1, -1)
-    number[kept] = np.arange(len(kept))
-    return fit(src, tgt, np.where(stays, number[label], -1), len(kept))
+    return fit_groups(src, tgt, np.where(stays, label, -1), max(least, 3))

@@ -44,7 +44,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     inlier_pr : float
         Largest residual of an inlier; gamma of the paper's quality.
     least : int
@@ -62,10 +61,6 @@ def prepare(
     failures : int
         Ends as well after so many proposals in a row that come to nothing. Not of the paper: among ten
         thousand correspondences its criterion asks for a billion triplets.
-
-    Returns
-    -------
-    callable
     """
     gamma = inlier_pr * model_spacing(scene.src)
 

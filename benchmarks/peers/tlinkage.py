@@ -15,7 +15,7 @@ from ibi_rs import synth
 from numpy.typing import NDArray
 
 from .contract import Register, model_spacing
-from .ecc import clusters, fit, residuals
+from .ecc import clusters, fit_groups, residuals
 from .triplets import Sampler
 
 Array = NDArray[np.float64]
@@ -43,7 +43,6 @@ def prepare(
 
     Parameters
     ----------
-    scene : ibi_rs.synth.Scene
     tau_pr : float
         Residual at which a preference has fallen to 1/e.
     least : int
@@ -56,10 +55,6 @@ def prepare(
         So many correspondences, drawn at random, take part.
     hypotheses, draws : int
         At most so many hypotheses, from at most so many triplets.
-
-    Returns
-    -------
-    callable
     """
     tau = tau_pr * model_spacing(scene.src)
 
@@ -71,14 +66,7 @@ def prepare(
             return np.empty((0, 4, 4))
         models = Sampler(src, tgt, neighbors, CUT * tau if rigid else None, rng).poses(draws, hypotheses)
         label = clusters(preferences(residuals(models, src, tgt), tau), t_merge=1)
-        count = np.bincount(label, minlength=1)
-        kept = np.flatnonzero(count >= max(least, 4))
-        kept = kept[np.argsort(-count[kept], kind="stable")]
-        if not len(kept):
-            return np.empty((0, 4, 4))
-        number = np.full(len(count), -1)
-        number[kept] = np.arange(len(kept))
-        return fit(src, tgt, number[label], len(kept))
+        return fit_groups(src, tgt, label, max(least, 4))
 
     return register
 

@@ -1,13 +1,16 @@
-"""The real scans as scenes: those shipped as examples, or all that are labelled, from a folder of scans.
+"""Real scans, as registration problems and as clouds to detect parts in; and ray-cast piles like these.
 
-Lengths are scaled so that the model has radius 1 about its middle, as in the synthetic layouts: several peers
-are set in these units. The camera is at the origin.
+Real are those shipped as examples, or all that are labelled, from a folder of scans: IBI_DATA. As scenes
+their lengths are scaled so that the model has radius 1 about its middle, as in the synthetic layouts: several
+peers are set in these units. The camera is at the origin.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -18,7 +21,12 @@ import numpy as np
 from ibi_rs import synth
 from numpy.typing import NDArray
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+from .records import ROOT
+from .timing import timed
+
+EXAMPLES = ROOT / "examples"
+FOLDER = Path(os.environ["IBI_DATA"]) if "IBI_DATA" in os.environ else None
+"""The folder of all labelled scans, if it is there."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,87 @@ def labels(folder: Path, name: str) -> NDArray[np.float64]:
     held = json.loads((folder / "gt_pseudo.json").read_text(encoding="utf-8"))
     instances = held["scenes"][name]["instances"] if "scenes" in held else held["instances"]
     return np.array([instance["T"] for instance in instances])
+
+
+# Clouds ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scan with its truth, camera at the origin.
+
+    Attributes
+    ----------
+    data : {"pile", "scan"}
+    name : str
+        The shape's or the scan's.
+    seed : int or None
+    mesh : (V, 3) float64 and (F, 3) int64
+    points : (N, 3) float64
+    poses : (K, 4, 4) float64
+    visibility : (K,) float64
+        All 1 in scans, whose labels are of parts in sight.
+    is_complete : bool
+        Whether all parts are labelled: precision means nothing elsewhere.
+    """
+
+    data: str
+    name: str
+    seed: int | None
+    mesh: tuple[NDArray[np.float64], NDArray[np.int64]]
+    points: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    visibility: NDArray[np.float64]
+    is_complete: bool = True
+
+
+def pile(path: Path, seed: int) -> Case:
+    """Make a pile of one mesh."""
+    mesh = ibi.io.read_mesh(path)
+    made = synth.pile_scene(*mesh, seed=seed)
+    return Case("pile", path.stem, seed, mesh, made.points, made.poses, made.visibility)
+
+
+def real() -> Iterator[Case]:
+    """Read the real scans that can be had."""
+    for name, scan in SCANS.items():
+        if not FOLDER and not scan.shipped:
+            continue
+        folder = FOLDER / scan.folder if FOLDER else EXAMPLES / str(scan.shipped)
+        mesh = ibi.io.read_mesh(folder / scan.mesh)
+        points, _ = ibi.io.read_cloud(folder / f"{scan.file or name}.ply")
+        poses = labels(folder, name)
+        yield Case("scan", name, None, mesh, points, poses, np.ones(len(poses)), scan.is_complete)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What `Model` finds in a scan on the way from its mesh, and the seconds: medians of the repeats.
+
+    `detect_s` is of all after the model, `search_s` of what follows the correspondences.
+    """
+
+    model: ibi.Model
+    matches: ibi.Matches
+    found: ibi.Registration
+    model_s: float
+    match_s: float
+    detect_s: float
+    search_s: float
+
+
+def detect(case: Case, repeats: int = 1) -> Detection:
+    """Detect the parts of a scan."""
+    seconds = []
+    for _ in range(repeats):
+        model_s, model = timed(ibi.Model.from_mesh, *case.mesh)
+        match_s, matches = timed(partial(model.correspond, case.points, viewpoint=[0, 0, 0]))
+        detect_s, found = timed(partial(model.detect, case.points, viewpoint=[0, 0, 0]))
+        seconds.append((model_s, match_s, detect_s, detect_s - match_s))
+    return Detection(model, matches, found, *(max(float(of), 0.0) for of in np.median(seconds, axis=0)))
+
+
+# Scenes ---------------------------------------------------------------------------------------------------
 
 
 @cache

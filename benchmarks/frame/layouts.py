@@ -22,7 +22,7 @@ import ibi_rs as ibi
 import numpy as np
 from ibi_rs import synth
 
-MODELS = Path(__file__).parents[1] / "examples/models"
+MODELS = Path(__file__).parents[2] / "examples/models"
 FIRST_SEED = {"tuning": 0, "reporting": 5000}
 SEEDS_PER_HALF = 5000
 # Without normals as if none were given: the cosines of two angles never differ by more than 2.
@@ -120,20 +120,7 @@ LAYOUTS = {
 def scenes(layout: str, half: str, count: int, modelnet: Path | None = None) -> Iterator[synth.Scene]:
     """Make the first scenes of a layout.
 
-    Parameters
-    ----------
-    layout : str
-        One of `LAYOUTS`.
-    half : {"tuning", "reporting"}
-        Which shapes and seeds.
-    count : int
-        How many scenes.
-    modelnet : pathlib.Path or None
-        File with the clouds of the layouts that need it: arrays (n, 3) named category/name.
-
-    Yields
-    ------
-    ibi_rs.synth.Scene
+    Those of ModelNet need a file with its clouds: arrays (n, 3) named category/name.
     """
     for seed in seeds(layout, half, count, modelnet):
         yield scene_of(layout, half, seed, modelnet)
@@ -182,8 +169,19 @@ def near_copies(kind: str, modelnet: Path | None = None) -> dict[str, set[str]]:
         return {
             name: {other for other in names if category(other) == category(name)} - {name} for name in names
         }
-    entries = json.loads((MODELS / "index.json").read_text(encoding="utf-8"))
-    return {e["file"]: set(e["like"]) for e in entries if e["symmetric"] == (kind == "symmetric")}
+    return {e["file"]: set(e["like"]) for e in index() if e["symmetric"] == (kind == "symmetric")}
+
+
+def index(folder: Path = MODELS) -> list[dict[str, Any]]:
+    """Return what is known of the meshes of a folder."""
+    entries: list[dict[str, Any]] = json.loads((folder / "index.json").read_text(encoding="utf-8"))
+    return entries
+
+
+def write_index(folder: Path, column: str, values: Mapping[str, Any]) -> None:
+    """Note something of each mesh of a folder."""
+    entries = [entry | {column: values[entry["file"]]} for entry in index(folder)]
+    (folder / "index.json").write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
 def category(name: str) -> str:
