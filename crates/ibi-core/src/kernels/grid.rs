@@ -156,16 +156,22 @@ impl Grid {
         grid
     }
 
-    /// Where a cell begins in the order, or would.
+    /// The places of the order from where one cell begins to where another one does, or would.
     #[inline(always)]
     #[allow(clippy::inline_always)] // in the head of inner loops
-    fn start(&self, cell: usize) -> usize {
-        if self.occupied.is_empty() { self.starts[cell] as usize } else { self.sparse_start(cell) }
+    fn run(&self, first: usize, end: usize) -> Range<usize> {
+        if self.occupied.is_empty() {
+            self.starts[first] as usize..self.starts[end] as usize
+        } else {
+            self.sparse_run(first, end)
+        }
     }
 
     #[cold]
-    fn sparse_start(&self, cell: usize) -> usize {
-        self.starts[self.occupied.partition_point(|&other| other < cell)] as usize
+    #[inline(never)]
+    fn sparse_run(&self, first: usize, end: usize) -> Range<usize> {
+        let start = |cell| self.starts[self.occupied.partition_point(|&other| other < cell)] as usize;
+        start(first)..start(end)
     }
 
     /// Whether so many columns are more than are worth looking at one by one.
@@ -234,7 +240,7 @@ impl Grid {
         }
         let (reach, row) = (left.sqrt(), self.index([x, y, 0]));
         let (first, last) = (self.along(2, place[2] - reach), self.along(2, place[2] + reach));
-        Some(self.start(row + first)..self.start(row + last + 1))
+        Some(self.run(row + first, row + last + 1))
     }
 
     /// For each cell that holds points: its range of [`Self::order`], and, ascending, those that hold every point within
@@ -273,7 +279,7 @@ impl Grid {
                 let reach = (left.sqrt() / wide * high) as usize + 1;
                 let row = self.index([other_x, other_y, 0]);
                 let (first, last) = (z.saturating_sub(reach), (z + reach).min(self.shape[2] - 1));
-                let run = self.start(row + first)..self.start(row + last + 1);
+                let run = self.run(row + first, row + last + 1);
                 if !run.is_empty() {
                     runs.push(run);
                 }
@@ -293,8 +299,11 @@ impl Grid {
         };
         let corner = self.index([first(0), first(1), first(2)]);
         let (next_x, next_y) = (self.shape[1] * self.shape[2], self.shape[2]);
-        let run = |at: usize| self.start(at)..self.start(at + 2);
-        [run(corner), run(corner + next_y), run(corner + next_x), run(corner + next_x + next_y)]
+        let corners = [corner, corner + next_y, corner + next_x, corner + next_x + next_y];
+        if !self.occupied.is_empty() {
+            return corners.map(|at| self.sparse_run(at, at + 2));
+        }
+        corners.map(|at| self.starts[at] as usize..self.starts[at + 2] as usize)
     }
 
     /// Hands ranges of [`Self::order`] to `look` that hold every point within a cell (a little less) of `place`: of each
@@ -308,7 +317,7 @@ impl Grid {
         for x in x.saturating_sub(1)..end(0, x) {
             for y in y.saturating_sub(1)..end(1, y) {
                 let row = self.index([x, y, 0]);
-                look(self.start(row + first)..self.start(row + last));
+                look(self.run(row + first, row + last));
             }
         }
     }

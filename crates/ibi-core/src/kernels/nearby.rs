@@ -312,7 +312,7 @@ impl Nearby {
         if self.is_fine {
             let sure = 2.0 * columns.seen;
             if sure < bound {
-                return search.row_within(sure).or_else(|| self.far_row(search, q, bound));
+                return search.row_within(sure).or_else(|| self.far_row(simd, q, bound));
             }
         }
         search.row_within(f32::INFINITY)
@@ -320,7 +320,9 @@ impl Nearby {
 
     /// What [`Self::row`] finds farther away than a cell is wide.
     #[cold]
-    fn far_row<S: Simd>(&self, mut search: Search<'_, S>, q: [f32; 3], bound: f32) -> Option<u32> {
+    #[inline(never)]
+    fn far_row<S: Simd>(&self, simd: S, q: [f32; 3], bound: f32) -> Option<u32> {
+        let mut search = Search::new(simd, self.sorted.columns(), q, bound * bound);
         let mut radius = self.sorted.first_radius(q);
         loop {
             for run in self.sorted.grid.around(q, radius.min(bound)) {
@@ -388,7 +390,7 @@ impl WithSimd for AnyWithinEach<'_> {
                     |run| search.look::<false>(run, NONE),
                 );
                 if nearby.is_fine && 2.0 * columns.seen < bound && !search.has_found(bound) {
-                    any.push(nearby.far_row(search, q, bound).is_some());
+                    any.push(nearby.far_row(simd, q, bound).is_some());
                     continue;
                 }
             }
@@ -777,31 +779,34 @@ impl<'a, S: Simd> Search<'a, S> {
     fn look<const SKIP: bool>(&mut self, run: Range<usize>, skip: u32) {
         let simd = self.simd;
         let mut start = run.start;
-        // Once in any case: most runs are short, and then no branch has to be guessed.
         loop {
-            for _ in 0..LANES / S::F32_LANES {
-                let lanes = start..start + S::F32_LANES;
-                let gap_sq = |axis: usize| {
-                    let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
-                    let gap = simd.sub_f32s(x, self.place[axis]);
-                    simd.mul_f32s(gap, gap)
-                };
-                let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
-                let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
-                let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
-                if SKIP {
-                    let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
-                    nearer = simd.and_m32s(nearer, other);
+            let end = run.end.min(start + LONG);
+            // Once in any case: most runs are short, and then no branch has to be guessed.
+            loop {
+                for _ in 0..LANES / S::F32_LANES {
+                    let lanes = start..start + S::F32_LANES;
+                    let gap_sq = |axis: usize| {
+                        let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
+                        let gap = simd.sub_f32s(x, self.place[axis]);
+                        simd.mul_f32s(gap, gap)
+                    };
+                    let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
+                    let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
+                    let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
+                    if SKIP {
+                        let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
+                        nearer = simd.and_m32s(nearer, other);
+                    }
+                    self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
+                    self.row = simd.select_u32s(nearer, row, self.row);
+                    start += S::F32_LANES;
                 }
-                self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
-                self.row = simd.select_u32s(nearer, row, self.row);
-                start += S::F32_LANES;
-            }
-            if start >= run.end {
-                return;
+                if start >= end {
+                    break;
+                }
             }
             // None is nearer than one that coincides; where so many do, the rest need not be looked at.
-            if (start - run.start).is_multiple_of(LONG) && self.simd.reduce_min_f32s(self.dist_sq) == 0.0 {
+            if start >= run.end || simd.reduce_min_f32s(self.dist_sq) == 0.0 {
                 return;
             }
         }
