@@ -321,7 +321,7 @@ pub fn hard_cases() -> Vec<Scene> {
         Scene { name, truth: Vec::new(), ..scene }
     };
     let one_pair = Scene { rows: vec![[3, 3]; 200], labels: vec![None; 200], ..easy() };
-    let mut repeated = easy();
+    let mut repeated = Recipe { true_pairs: 30, num_outliers: 60, ..Recipe::default() }.build();
     repeated.rows = [&repeated.rows[..], &repeated.rows[..], &repeated.rows[..]].concat();
     repeated.labels = [&repeated.labels[..], &repeated.labels[..], &repeated.labels[..]].concat();
     let one_source = Scene { rows: (0..200).map(|row| [7, row]).collect(), ..easy() };
@@ -369,12 +369,12 @@ fn on_a_plane(i: usize) -> Point3<f64> {
     Point3::new(radius * angle.cos() * 1.5 + 0.01 * (i % 7) as f64, radius * angle.sin(), 0.0)
 }
 
-/// A plate with a step: hundreds of points with exactly z = 0, and one axis value shared by many elsewhere.
+/// A plate with a step: a hundred points with exactly z = 0, and one axis value shared by many elsewhere.
 fn cad_part() -> Vec<Point3<f64>> {
     let grid = |nx: usize, ny: usize, z: f64| {
         (0..nx * ny).map(move |i| Point3::new((i % nx) as f64 * 0.1, (i / nx) as f64 * 0.1, z))
     };
-    grid(20, 12, 0.0).chain(grid(8, 5, 0.5)).chain(grid(4, 12, 0.9)).collect()
+    grid(14, 8, 0.0).chain(grid(6, 3, 0.5)).chain(grid(3, 8, 0.9)).collect()
 }
 
 /// 40 different points and 60 at one place.

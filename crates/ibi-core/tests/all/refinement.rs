@@ -188,9 +188,10 @@ fn icp_comes_closer_to_the_truth() {
     // The same points; and the same surface sampled anew, where the truth is not the least cost any more and
     // points, unlike planes, hold each other where they are: the share of the error that may be left.
     for (sampling, of_points, of_planes) in [(500, 1e-3, 1e-3), (1700, 0.6, 0.2)] {
+        let model = Oriented::model(sampling);
         for seed in 0..10 {
             let truth = rng.pose_at(Vector3::new(3.0, -2.0, 5.0));
-            let target = Oriented::model(sampling).moved(&truth);
+            let target = model.moved(&truth);
             let near = Nearby::new(&target.points, 3.0 * spacing);
             let axis = rng.normal_vector().normalize() * 3_f64.to_radians();
             let shift = rng.normal_vector().normalize() * (0.5 * spacing);

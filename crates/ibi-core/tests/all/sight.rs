@@ -101,7 +101,7 @@ proptest! {
     #[test]
     fn a_plate_hides_the_floor_behind_it(pose in rigid_motions(50.0), x in -0.5..0.5_f64, y in -0.5..0.5_f64) {
         let step = 0.05;
-        let floor = sheet([-3.0, 3.0], [-3.0, 3.0], 0.0, step);
+        let floor = sheet([-1.6, 1.6], [-1.6, 1.6], 0.0, step);
         let plate = sheet([-0.5, 0.5], [-0.5, 0.5], 1.0, step);
         let num_floor = floor.len();
         let points: Vec<_> = floor.into_iter().chain(plate).collect();
