@@ -59,6 +59,10 @@ def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
     return _aligned(array, np.float64)
 
 
+_FARTHEST = 1e150
+"""Squares of distances end there."""
+
+
 def _scan_points(name: str, value: Any) -> tuple[npt.NDArray[np.float64], int]:
     """(N, 3) float64 of a scan, organised or not, without rows that are not finite; and how many went."""
     points, _, num_dropped = _scan(name, value, None)
@@ -68,7 +72,7 @@ def _scan_points(name: str, value: Any) -> tuple[npt.NDArray[np.float64], int]:
 def _scan(
     name: str, points: Any, normals: Any
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None, int]:
-    """Points and normals of a scan, as `_scan_points`: a row of which the point is not finite goes."""
+    """Points and normals of a scan, as `_scan_points`: a row of which either is not finite goes."""
     if isinstance(points, np.ndarray) and points.ndim == 3:
         points = points.reshape(-1, points.shape[-1])
     if isinstance(normals, np.ndarray) and normals.ndim == 3:
@@ -80,7 +84,15 @@ def _scan(
             f"{name}_normals has {len(of_points)} rows; it must have one for each of the {len(held)} rows of"
             f" {name}"
         )
+    beyond = held[np.isfinite(held) & (np.abs(held) > _FARTHEST)]
+    if len(beyond):
+        raise InputError(f"{name} has a coordinate of {beyond[0]:g}; {_FARTHEST:g} is the largest allowed")
     finite = np.isfinite(held).all(axis=1)
+    if of_points is not None:
+        finite &= np.isfinite(of_points).all(axis=1)
+        without = np.nonzero(~of_points.any(axis=1))[0]
+        if len(without):
+            raise InputError(f"{name}_normals[{without[0]}] has length 0; a normal must have a direction")
     num_dropped = len(held) - int(finite.sum())
     if num_dropped:
         held, of_points = held[finite], None if of_points is None else of_points[finite]

@@ -555,7 +555,7 @@ class Model:
         """
         if params is None:
             params = Params() if viewpoint is None else Params.single_view()
-        params = _limited(params, max_instances, timeout_s)
+        params, num_threads = _limited(params, max_instances, timeout_s), _num_threads(num_threads)
         clock = Clock(params.timeout_s)
         try:
             with clock:

@@ -167,6 +167,8 @@ def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:
         raise InputError(f"{path}: clouds are read from {', '.join(sorted(readers))}, not from '{suffix}'")
     rows = reading(path, lambda: readers[suffix](path))
     points = np.asarray(rows.points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{path}: its points are of shape {points.shape}, not (N, 3)")
     finite = np.isfinite(points).all(axis=1)
     normals = rows.normals
     if normals is not None:

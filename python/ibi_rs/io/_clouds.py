@@ -20,8 +20,9 @@ LAZ_POINTS_PER_BYTE = 1000
 
 def pcd(path: Path) -> Rows:
     """Read a PCD file, its normals and the viewpoint."""
+    reader = extra("pypcd4")
     said = _check_pcd(path)
-    cloud = extra("pypcd4").PointCloud.from_path(path)
+    cloud = reader.PointCloud.from_path(path)
     check_count(said, len(np.atleast_1d(cloud.pc_data)), "points")
     names = ("normal_x", "normal_y", "normal_z")
     normals = cloud.numpy(names) if all(name in cloud.fields for name in names) else None
@@ -73,8 +74,9 @@ def _check_pcd(path: Path) -> int:
 
 def las(path: Path) -> Rows:
     """Read a LAS or LAZ file."""
+    reader = extra("laspy")
     said = _check_las(path)
-    points = np.asarray(extra("laspy").read(path).xyz)
+    points = np.asarray(reader.read(path).xyz)
     check_count(said, len(points), "points")
     return Rows(points)
 

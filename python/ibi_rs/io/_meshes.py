@@ -37,8 +37,8 @@ def check_suffix(path: Path) -> None:
 
 def mesh(path: Path) -> tuple[Floats, Faces]:
     """Vertices and triangles; vertices at one place are one."""
-    _check_file(path)
     trimesh = extra("trimesh")
+    _check_file(path)
     cut = _concave(path)
     if cut is not None:
         loaded = trimesh.Trimesh(*cut, process=False)
@@ -93,8 +93,9 @@ def _is_scanned(points: npt.NDArray[Any], faces: npt.NDArray[Any]) -> bool:
 
 
 def _loaded(path: Path) -> Any:
+    trimesh = extra("trimesh")
     _check_file(path)
-    loaded = extra("trimesh").load(path, process=False)
+    loaded = trimesh.load(path, process=False)
     _check_loaded(path, loaded)
     return loaded
 

@@ -69,8 +69,8 @@ pub enum MetricsError {
     /// A model needs at least one point: a mean or a maximum over none has no value.
     #[error("the model has no points")]
     EmptyModel,
-    /// A model point is NaN or infinite.
-    #[error("model point {index} is not finite")]
+    /// A coordinate of a model point is NaN, infinite or beyond 1e150, where squares of distances end.
+    #[error("model point {index} is not finite, or beyond 1e150")]
     NonFinitePoint {
         /// Row of the first such point.
         index: usize,

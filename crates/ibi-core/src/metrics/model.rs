@@ -48,12 +48,13 @@ impl Model {
     ///
     /// # Errors
     ///
-    /// [`MetricsError::EmptyModel`] without points, [`MetricsError::NonFinitePoint`] if a point is not finite.
+    /// [`MetricsError::EmptyModel`] without points, [`MetricsError::NonFinitePoint`] if a coordinate is not finite, or beyond
+    /// 1e150.
     pub fn new(points: Vec<Point3<f64>>) -> Result<Self, MetricsError> {
         if points.is_empty() {
             return Err(MetricsError::EmptyModel);
         }
-        if let Some(index) = points.iter().position(|p| !p.iter().all(|x| x.is_finite())) {
+        if let Some(index) = points.iter().position(|p| !p.iter().all(|x| x.abs() <= 1e150)) {
             return Err(MetricsError::NonFinitePoint { index });
         }
         Ok(Self { points, tree: OnceLock::new(), diameter: OnceLock::new() })
