@@ -3,7 +3,7 @@
 use std::fmt;
 use std::ops::ControlFlow;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use crate::error::Error;
@@ -92,6 +92,14 @@ pub struct Interrupt {
     start: Instant,
     timeout_s: f64,
     watcher: Option<Watcher>,
+    asks: Option<Arc<Asks>>,
+}
+
+/// How often an interrupt was asked, and how often it lets go on.
+#[derive(Debug)]
+struct Asks {
+    made: AtomicUsize,
+    most: usize,
 }
 
 /// Is told each phase as it begins, by the thread that begins it.
@@ -101,7 +109,7 @@ impl Interrupt {
     /// Set once `token` is, or once `timeout_s` seconds have gone by since `start`.
     #[must_use]
     pub fn new(token: CancelToken, start: Instant, timeout_s: Option<f64>) -> Self {
-        Self { token, start, timeout_s: timeout_s.unwrap_or(f64::INFINITY), watcher: None }
+        Self { token, start, timeout_s: timeout_s.unwrap_or(f64::INFINITY), watcher: None, asks: None }
     }
 
     /// With a limit of time in the place of the one that it has, if any is given.
@@ -126,6 +134,21 @@ impl Interrupt {
         self
     }
 
+    /// One that lets go on when it is asked so often, and is set from then on: for tests, which so end a computation wherever
+    /// they want to.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn after_asks(most: usize) -> Self {
+        Self { asks: Some(Arc::new(Asks { made: AtomicUsize::new(0), most })), ..Self::never() }
+    }
+
+    /// How often one of [`Self::after_asks`] was asked.
+    #[doc(hidden)]
+    #[must_use]
+    pub fn num_asked(&self) -> usize {
+        self.asks.as_ref().map_or(0, |asks| asks.made.load(Ordering::Relaxed))
+    }
+
     /// Tells the watcher, if there is one, that `phase` begins.
     pub fn begin(&self, phase: Phase) {
         if let Some(watcher) = &self.watcher {
@@ -146,7 +169,9 @@ impl Interrupt {
     /// Whether the computation is to end; what it returns then is thrown away.
     #[must_use]
     pub fn is_set(&self) -> bool {
-        self.token.is_cancelled() || self.elapsed_s() >= self.timeout_s
+        let is_asked_enough =
+            || self.asks.as_ref().is_some_and(|asks| asks.made.fetch_add(1, Ordering::Relaxed) >= asks.most);
+        self.token.is_cancelled() || is_asked_enough() || self.elapsed_s() >= self.timeout_s
     }
 
     /// An error once the computation is to end.

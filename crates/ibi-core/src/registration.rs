@@ -56,8 +56,8 @@ pub struct Pose {
     pub score: f64,
     /// Share of source points within `d_op` of a target point, 0 to 1.
     pub overlap: f64,
-    /// How much closer the source lies to the target than chance would have it: 1 for a perfect fit, 0 for one as by
-    /// chance. See [`crate::kernels::evidence::Support::closeness`].
+    /// How much closer the source lies to the target than chance would have it: 0 as by chance, 1 for a perfect fit. In
+    /// a scene seen from one side 1 is as close as its own points lie to each other on average, and it may be more. See [`crate::kernels::evidence::Support::closeness`].
     pub closeness: f64,
     /// Mean over the correspondences whose target point lies within 2 `d_op` of this instance, and of no other
     /// pose, of 1 - d / 2 `d_op`, d being that distance, 0 to 1.

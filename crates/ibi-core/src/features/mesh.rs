@@ -108,6 +108,7 @@ pub fn sample_mesh(
     }
     let (mut rng, mut kept) = (Rng::new(seed, 0, 0), Kept::new(count, spacing, mesh.vertices[0]));
     let mut radius = spacing;
+    let farthest = mesh.vertices.iter().map(|p| p.coords.amax()).fold(0.0, f64::max);
     let is_full = |kept: &Kept| matches!(amount, Amount::Count(n) if kept.sampled.points.len() >= n);
     while !is_full(&kept) {
         let draws = if matches!(amount, Amount::Count(_)) { DRAWS_A_SIZE } else { DRAWS };
@@ -128,6 +129,10 @@ pub fn sample_mesh(
             break;
         }
         radius *= SHRINK;
+        // Points that the numbers cannot hold so near to each other fall onto each other, and for ever.
+        if radius < f64::EPSILON * farthest {
+            radius = 0.0;
+        }
     }
     Ok(kept.sampled)
 }

@@ -356,3 +356,47 @@ impl<'a> Screen<'a> {
 fn on_screen(axes: &[Vector3<f64>; 3], origin: Point3<f64>, point: &Point3<f64>) -> [f64; 3] {
     axes.map(|axis| axis.dot(&(point - origin)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::rng::Rng;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(40))]
+
+        // Of all faces each that hides a point is among those that its pixel shows: large ones, long and thin ones, and of
+        // no area; wherever the points lie.
+        #[test]
+        fn a_point_is_seen_where_no_face_of_all_hides_it(
+            seed: u64, num_faces in 1..3000_usize, size in prop::sample::select(vec![0.003, 0.1, 1.0]), thin in 0..3_u32,
+        ) {
+            let mut rng = Rng::new(seed, 0, 0);
+            let mut vector = |half: f64| Vector3::from([0; 3].map(|_: u32| half * (2.0 * rng.unit() - 1.0)));
+            let (mut vertices, mut faces) = (Vec::new(), Vec::new());
+            for face in 0..num_faces {
+                let a = Point3::from(vector(1.0));
+                let along = vector(size);
+                let across = if thin == 0 { vector(size) } else { along * 0.4 + vector(1e-4 * f64::from(thin - 1)) };
+                vertices.extend([a, a + along, a + across]);
+                faces.push([3 * face, 3 * face + 1, 3 * face + 2]);
+            }
+            let mesh = Mesh { vertices: &vertices, faces: &faces };
+            let asked: Vec<Point3<f64>> = (0..200)
+                .map(|_| Point3::from(vector(1.2)))
+                .chain(vertices.iter().copied().take(100))
+                .collect();
+            let (low, high) = bounds(&vertices);
+            let (to_eye, rounding) = (vector(1.0).normalize(), 1e-9 * (high - low).norm());
+            let never = Interrupt::never();
+            let patches = Patches::new(&mesh, low, high, &never).unwrap();
+            let screen = Screen::new(&patches, to_eye, rounding, &asked, &never);
+            for point in &asked {
+                let p = on_screen(&screen.axes, screen.origin, point);
+                let is_hidden = (0..num_faces).any(|face| screen.hides(&screen.corners(face), p));
+                prop_assert_eq!(screen.sees(point), !is_hidden);
+            }
+        }
+    }
+}

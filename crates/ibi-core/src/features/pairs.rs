@@ -127,3 +127,19 @@ fn linear(cos: f32) -> u32 {
 fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // More than 16 bits can count, as all that a huge radius holds may be.
+    #[test]
+    fn counts_very_many_neighbors() {
+        let (count, mut pairs) = (200_001, Pairs::default());
+        pairs.clear(count);
+        pairs.fill((0..count).map(|k| ([1.0, k as f32 * 1e-9, 0.0], [0.0, 0.0, 1.0])));
+        let counts = pairs.count([0.0, 0.0, 1.0]);
+        assert_eq!(counts.map(|bins| bins.iter().sum::<u32>()), [count as u32; 3]);
+        assert_eq!(counts[0][5], count as u32);
+    }
+}

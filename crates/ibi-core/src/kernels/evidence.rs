@@ -60,10 +60,15 @@ impl Support {
         n * (part(share, p) + part(1.0 - share, 1.0 - p)) / std::f64::consts::LN_10
     }
 
-    /// How much closer the source fits than chance would have it: 0 as by chance, 1 as close as can be.
+    /// How much closer the source fits than chance would have it: 0 as by chance, 1 as close as the scene lets a pose be.
+    ///
+    /// In a scene seen from one side that is how closely its own points fit each other on average, which an instance whose
+    /// surface is smoother than the rest may surpass: then it is more than 1. 0 also where the points of the scene fit each
+    /// other no better than by chance: nothing can be told.
     #[must_use]
     pub fn closeness(&self) -> f64 {
-        (self.fit - self.chance_fit) / (self.best_fit - self.chance_fit).max(f64::EPSILON)
+        let range = self.best_fit - self.chance_fit;
+        if range > 0.0 { (self.fit - self.chance_fit) / range } else { 0.0 }
     }
 
     /// Logarithm of the odds that the pose is right.

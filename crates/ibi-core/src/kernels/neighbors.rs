@@ -128,3 +128,27 @@ impl std::fmt::Debug for Neighbors {
         f.debug_struct("Neighbors").finish_non_exhaustive()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::rng::Rng;
+
+    // Several trees answer as one comparison with all points does.
+    #[test]
+    fn a_large_cloud_in_parts() {
+        let mut rng = Rng::new(1, 0, 0);
+        let mut point = |half: f64| Point3::from([0; 3].map(|_: u32| half * (rng.unit() - 0.5)));
+        let cloud: Vec<_> =
+            (0..2 * MOST + 100).map(|row| point(if row % 3 == 0 { 1e-3 } else { 1.0 })).collect();
+        let tree = Neighbors::new(&cloud);
+        assert!(tree.parts.len() > 2);
+        for _ in 0..100 {
+            let query = point(1.5);
+            let least = cloud.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min);
+            let (row, dist_sq) = tree.nearest(&query).unwrap();
+            assert!((dist_sq - least).abs() <= 1e-15 * (1.0 + least));
+            assert!(((cloud[row as usize] - query).norm_squared() - dist_sq).abs() <= 1e-15);
+        }
+    }
+}

@@ -8,7 +8,6 @@ use nalgebra::{Isometry3, Point3, Unit, Vector3};
 
 use super::columns::middle;
 use super::grid::buckets;
-use super::nearby::mean_spacing;
 use super::par;
 use crate::interrupt::{Interrupt, Phase};
 use crate::pace::Pace;
@@ -59,6 +58,9 @@ const ASIDE: f64 = 0.9;
 const BEFORE: f64 = 1.0;
 const RISE: f64 = 0.25;
 
+/// A cell with more points than so many is crowded.
+const CROWDED: u32 = 64;
+
 /// Cells on a side at most.
 const MAX_CELLS: f64 = 1024.0;
 
@@ -70,6 +72,9 @@ const MOST: usize = 50_000;
 /// were few enough. On a surface they then hold a few each.
 const WIDEN: f64 = 1.25;
 const FIRST_WIDTH: f64 = 2.0;
+
+/// Mean distance to the nearest other one of points of which each has a voxel of a surface.
+const SPACING_PER_WIDTH: f64 = 0.8;
 
 /// Which points of a surface the surface itself hides, as seen from far away in one of 128 directions.
 #[derive(Debug)]
@@ -116,9 +121,10 @@ impl OwnShadow {
         let directions: Vec<_> = (0..DIRECTIONS).map(|i| direction(i, DIRECTIONS)).collect();
         let (mut some, mut of_all) = (None, None);
         if points.len() > MOST {
-            let (rows, answer) = few(points, normals, spacing, interrupt)?;
+            let (rows, answer, width) = few(points, normals, spacing, interrupt)?;
             let kept: Vec<_> = rows.iter().map(|&row| points[row as usize]).collect();
-            let spacing = mean_spacing(&kept);
+            // Not measured: what is nearest may lie on the other side of a wall.
+            let spacing = spacing.max(SPACING_PER_WIDTH * width);
             some = Some((kept, rows.iter().map(|&row| normals[row as usize]).collect::<Vec<_>>(), spacing));
             of_all = Some(OfAll { answer, is_hidden: (0..DIRECTIONS).map(|_| OnceLock::new()).collect() });
         }
@@ -157,13 +163,14 @@ impl OwnShadow {
     }
 }
 
-/// At most [`MOST`] of the points, by row, and which of them answers for each point; `None` if interrupted.
+/// At most [`MOST`] of the points, by row, which of them answers for each point, and the width of a voxel; `None` if
+/// interrupted.
 fn few(
     points: &[Point3<f64>],
     normals: &[Vector3<f64>],
     spacing: f64,
     interrupt: &Interrupt,
-) -> Option<(Vec<u32>, Vec<u32>)> {
+) -> Option<(Vec<u32>, Vec<u32>, f64)> {
     /// For each axis.
     const BITS: u32 = 20;
     let first = *points.first()?;
@@ -195,7 +202,7 @@ fn few(
             answer.push(of);
         }
         if rows.len() <= MOST {
-            return Some((rows, answer));
+            return Some((rows, answer, width));
         }
         width *= WIDEN;
     }
@@ -235,7 +242,14 @@ fn hidden(
         let [column, row] = cell_of(at);
         column * shape[1] + row
     };
-    let (starts, rows) = buckets(shape[0] * shape[1], (0..).zip(on_screen.iter().map(index)));
+    let (starts, mut rows) = buckets(shape[0] * shape[1], (0..).zip(on_screen.iter().map(index)));
+    // Where many points share a cell, those that come first are nearest to the eye, and those too far back left out.
+    let depth = |q: u32| points[q as usize].coords.dot(to_eye);
+    let is_crowded = |cell: usize| starts[cell + 1] - starts[cell] > CROWDED;
+    for cell in (0..shape[0] * shape[1]).filter(|&cell| is_crowded(cell)) {
+        let rows = &mut rows[starts[cell] as usize..starts[cell + 1] as usize];
+        rows.sort_unstable_by(|&a, &b| depth(b).total_cmp(&depth(a)).then(a.cmp(&b)));
+    }
     let hides = |q: usize, p: usize| {
         let gap = [0, 1].map(|k| on_screen[q][k] - on_screen[p][k]);
         let offset = points[q] - points[p];
@@ -248,11 +262,18 @@ fn hidden(
     let mut is_hidden = |p: usize| {
         let [column, row] = cell_of(&on_screen[p]);
         (column.saturating_sub(1)..(column + 2).min(shape[0])).any(|x| {
-            let first = starts[x * shape[1] + row.saturating_sub(1)];
-            let last = starts[x * shape[1] + (row + 2).min(shape[1])];
-            // Cells may be crowded.
-            !pace.is_over((last - first) as usize)
-                && rows[first as usize..last as usize].iter().any(|&q| hides(q as usize, p))
+            let [first, last] = [row.saturating_sub(1), (row + 2).min(shape[1])].map(|y| x * shape[1] + y);
+            let run = |from: usize, to: usize| &rows[starts[from] as usize..starts[to] as usize];
+            if !(first..last).any(is_crowded) {
+                return run(first, last).iter().any(|&q| hides(q as usize, p));
+            }
+            let least = depth(p as u32) + (1.0 - 1e-9) * BEFORE * spacing;
+            (first..last).any(|cell| {
+                let cell = run(cell, cell + 1);
+                let is_sorted = cell.len() > CROWDED as usize;
+                let before = if is_sorted { cell.partition_point(|&q| depth(q) > least) } else { cell.len() };
+                !pace.is_over(before) && cell[..before].iter().any(|&q| hides(q as usize, p))
+            })
         })
     };
     (0..points.len()).map(|p| normals[p].dot(to_eye) > 0.0 && is_hidden(p)).collect()
