@@ -49,6 +49,18 @@ test-clusters: $(STAMPS)/package $(STAMPS)/group-clusters ## run batches on a lo
 test-viz: $(STAMPS)/package $(STAMPS)/group-viz ## read recordings of Rerun back (installs it)
 	$(BIN)/python -m pytest tests/test_viz.py
 
+FUZZ_S ?= 60
+FUZZ_TARGETS := register features metrics params
+
+.PHONY: fuzz
+fuzz: cargo $(STAMPS)/package $(STAMPS)/group-test ## throw odd inputs at all that takes any, FUZZ_S=60 seconds at each (installs cargo-fuzz)
+	@cargo fuzz --version >/dev/null 2>&1 || cargo install --quiet --locked cargo-fuzz
+	@mkdir -p $(addprefix fuzz/corpus/,$(FUZZ_TARGETS))
+	cd fuzz && for target in $(FUZZ_TARGETS); do \
+		cargo fuzz run --sanitizer none $$target corpus/$$target seeds/$$target -- \
+			-max_total_time=$(FUZZ_S) -timeout=60 -rss_limit_mb=2048 -print_final_stats=1 -verbosity=0; done
+	IBI_FUZZ_EXAMPLES=$$((2 * $(FUZZ_S))) $(BIN)/python -m pytest tests/test_fuzz.py
+
 .PHONY: bench
 bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac picks some
 	cargo bench -p ibi-core --bench '*' -- $(ARGS)

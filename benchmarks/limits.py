@@ -16,10 +16,6 @@ A case is one line in `CASES`; a new one needs a function that makes a call of a
 
 from __future__ import annotations
 
-import argparse
-import csv
-import os
-import platform
 import signal
 import time
 from collections.abc import Callable
@@ -30,8 +26,8 @@ from typing import Any
 
 import ibi_rs as ibi
 import numpy as np
-
-RECORDS = Path(__file__).parent / "records"
+from frame import cli, records, timing
+from frame.tables import show
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 LONGEST_S = 0.5
@@ -236,8 +232,8 @@ def by_signal(call: Call, after_s: float) -> float:
 
 def exponent(sizes: list[int], seconds: list[float]) -> float:
     """Return the slope of log time over log size; NaN where too little takes long enough."""
-    points = [(np.log(n), np.log(s)) for n, s in zip(sizes, seconds, strict=True) if s >= LEAST_S]
-    return float(np.polyfit(*zip(*points, strict=True), 1)[0]) if len(points) >= 2 else float("nan")
+    points = [(n, s) for n, s in zip(sizes, seconds, strict=True) if s >= LEAST_S]
+    return timing.exponent(*zip(*points, strict=True))[0] if len(points) >= 2 else float("nan")
 
 
 def run(case: Case, repeats: int, longest_s: float, clock: Callable[[], float]) -> list[dict[str, Any]]:
@@ -265,20 +261,17 @@ def run(case: Case, repeats: int, longest_s: float, clock: Callable[[], float]) 
 
 def main() -> None:
     """Run what was asked for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    args = cli.parse(
+        __doc__,
+        cli.option("--only", default="", help="cases whose name holds this"),
+        cli.repeats(3),
+        cli.option("--longest", type=float, default=60.0, help="seconds after which no larger size is tried"),
+        cli.flag("--docs", "write the record"),
+        cli.option("--out", type=Path, help="folder for the record; by default benchmarks/records"),
+        cli.flag("--cpu", "seconds of the processor for the growth"),
     )
-    parser.add_argument("--only", default="", help="cases whose name holds this")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument(
-        "--longest", type=float, default=60.0, help="seconds after which no larger size is tried"
-    )
-    parser.add_argument("--docs", action="store_true", help="write the record")
-    parser.add_argument("--out", type=Path, help="folder for the record; by default benchmarks/records")
-    parser.add_argument("--cpu", action="store_true", help="seconds of the processor for the growth")
-    args = parser.parse_args()
     clock = time.process_time if args.cpu else time.perf_counter
-    print(f"{os.cpu_count()} cores, {platform.machine()}, ibi_rs {ibi.__version__}", flush=True)
+    cli.machine()
     fields = ["case", "size", "seconds", "exponent", "late_by_signal", "late_by_timeout"]
     print(f"{'case':28s}  {'size':>8s}  {'seconds':>8s}  exponent  late by signal, by timeout")
     record = []
@@ -287,15 +280,10 @@ def main() -> None:
             continue
         for row in run(case, args.repeats, args.longest, clock):
             cells = [row.get(name, "") for name in fields]
-            print("{:28s}  {:>8}  {:>8}  {:>8}  {:>14}  {:>10}".format(*cells), flush=True)
-            record.append({name: row.get(name, "") for name in fields})
+            show("{:28s}  {:>8}  {:>8}  {:>8}  {:>14}  {:>10}".format(*cells))
+            record.append(row)
     if args.docs or args.out:
-        path = (args.out or RECORDS) / "limits.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w", newline="", encoding="utf-8") as file:
-            out = csv.DictWriter(file, fields, lineterminator="\n")
-            out.writeheader()
-            out.writerows(record)
+        records.write(args.out or records.RECORDS, "limits.csv", record, fields)
 
 
 if __name__ == "__main__":

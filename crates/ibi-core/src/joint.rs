@@ -82,6 +82,9 @@ pub(crate) fn joint_check(
     measured.drain(..).flatten().map(|own| own.support).collect()
 }
 
+/// Where no pose is near more others than this each is asked for each, which is quicker than a ledger of so few.
+const FEW_NEAR: usize = 16;
+
 struct Check<'a> {
     problem: &'a Problem<'a>,
     params: &'a Params,
@@ -106,12 +109,13 @@ impl Check<'_> {
             par::map(found.len(), 256, |a| (0..found.len()).filter(|&b| are_near(b, a)).count());
         let mut ledger = Ledger::new(scene, params.d_op_pr, poses);
         let disputed: Vec<usize> = (0..found.len()).filter(|&at| num_near[at] > 0).collect();
-        if !disputed.is_empty() {
+        let are_many = num_near.iter().any(|&num| num > FEW_NEAR);
+        if are_many {
             let rows = grace.map(disputed.len(), |_| self.cost, |i| self.rows(&found[disputed[i]]));
             ledger.enter(rows.into_iter().flatten().flatten(), &disputed, self.cost, grace);
         }
         // Correspondences need not be points of the clouds: then a row may matter to an instance that is far from it.
-        let is_loose = !problem.pairs.are_rows;
+        let asks_all = !are_many || !problem.pairs.are_rows || !self.hv.is_repeatable();
         let mut measured: Vec<Option<Own>> = vec![None; found.len()];
         let mut is_stale: Vec<bool> = (0..found.len()).map(|at| ledger.holds(at)).collect();
         loop {
@@ -148,8 +152,7 @@ impl Check<'_> {
                     num_near[at] -= 1;
                     is_stale[at] |= num_near[at] == 0;
                 }
-                let asks_more = is_loose || !self.hv.is_repeatable();
-                is_stale[at] |= asks_more && problem.are_near(params, found[at].pose(), found[worst].pose());
+                is_stale[at] |= asks_all && problem.are_near(params, found[at].pose(), found[worst].pose());
             }
             for at in 0..found.len() {
                 is_stale[at] &= measured[at].is_some();

@@ -31,6 +31,7 @@ const CELLS_PER_POINT: usize = 4;
 /// average, only the cells that hold points are kept, and searched for: clusters that lie far apart.
 const MOST_WIDENED: f32 = 2.0;
 const MOST_SHARED: usize = 1024;
+const SHARING_SAMPLE: usize = 256;
 
 /// Cells per axis of a sparse grid at most: then a number of 64 bits names each.
 const MAX_PER_SPARSE_AXIS: usize = 1 << 21;
@@ -64,17 +65,28 @@ impl Grid {
     pub(crate) fn in_box(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
         let grid = Self::dense(points, bounds, cell);
         let widened = cell * grid.inv_cell.iter().fold(f32::INFINITY, |least, &inv| least.min(inv));
-        if widened * MOST_WIDENED < 1.0 && grid.sharing() > MOST_SHARED {
+        if widened * MOST_WIDENED < 1.0 && grid.sharing(points) > MOST_SHARED {
             Self::sparse(points, bounds, cell)
         } else {
             grid
         }
     }
 
-    /// With how many others a point shares its cell, on average.
-    pub(crate) fn sharing(&self) -> usize {
-        let lens = self.starts.windows(2).map(|run| (run[1] - run[0]) as usize);
-        lens.map(|len| len * len).sum::<usize>() / self.order.len().max(1)
+    /// With how many others a point shares its cell, on average over some of `points`, those of the grid.
+    pub(crate) fn sharing(&self, points: &[Vec<f32>; 3]) -> usize {
+        let step = self.order.len().div_ceil(SHARING_SAMPLE).max(1);
+        let some = (0..self.order.len()).step_by(step);
+        let num = some.len().max(1);
+        let len = |i: usize| {
+            let cell = self.index(self.cell(points.each_ref().map(|axis| axis[i])));
+            self.run(cell, cell + 1).len()
+        };
+        some.map(len).sum::<usize>() / num
+    }
+
+    /// Whether all cells are known, and not only those that hold points.
+    pub(crate) fn is_dense(&self) -> bool {
+        self.occupied.is_empty()
     }
 
     /// How far a place is from the box that holds the bulk of the points.
@@ -176,8 +188,8 @@ impl Grid {
 
     /// Whether so many columns are more than are worth looking at one by one.
     fn are_too_many(&self, low: [usize; 3], high: [usize; 3]) -> bool {
-        let columns = (high[0] - low[0] + 1).saturating_mul(high[1] - low[1] + 1);
-        !self.occupied.is_empty() && columns > self.occupied.len()
+        let columns = || (high[0] - low[0] + 1).saturating_mul(high[1] - low[1] + 1);
+        !self.is_dense() && columns() > self.occupied.len()
     }
 
     /// The points, by cell; within a cell in their own order.
@@ -289,7 +301,7 @@ impl Grid {
     }
 
     /// Ranges of [`Self::order`] that hold every point within half a cell (a little less) of `place`: of each axis two
-    /// neighbouring cells.
+    /// neighbouring cells. Only where [`Self::is_dense`].
     #[inline(always)]
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn block(&self, place: [f32; 3]) -> [Range<usize>; 4] {
@@ -299,15 +311,12 @@ impl Grid {
         };
         let corner = self.index([first(0), first(1), first(2)]);
         let (next_x, next_y) = (self.shape[1] * self.shape[2], self.shape[2]);
-        let corners = [corner, corner + next_y, corner + next_x, corner + next_x + next_y];
-        if !self.occupied.is_empty() {
-            return corners.map(|at| self.sparse_run(at, at + 2));
-        }
-        corners.map(|at| self.starts[at] as usize..self.starts[at + 2] as usize)
+        let run = |at: usize| self.starts[at] as usize..self.starts[at + 2] as usize;
+        [run(corner), run(corner + next_y), run(corner + next_x), run(corner + next_x + next_y)]
     }
 
     /// Hands ranges of [`Self::order`] to `look` that hold every point within a cell (a little less) of `place`: of each
-    /// axis three neighbouring cells.
+    /// axis three neighbouring cells. Only where [`Self::is_dense`].
     #[inline(always)]
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn each_of_wide_block(&self, place: [f32; 3], mut look: impl FnMut(Range<usize>)) {
@@ -317,7 +326,7 @@ impl Grid {
         for x in x.saturating_sub(1)..end(0, x) {
             for y in y.saturating_sub(1)..end(1, y) {
                 let row = self.index([x, y, 0]);
-                look(self.run(row + first, row + last));
+                look(self.starts[row + first] as usize..self.starts[row + last] as usize);
             }
         }
     }

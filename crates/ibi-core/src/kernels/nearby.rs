@@ -27,8 +27,8 @@ pub struct Nearby {
     sorted: Sorted,
     /// With the points that coincide with another one, where there are so many that the first leaves them out.
     all: Option<Sorted>,
-    /// Whether the cells are narrower than the reach, as too many points lie within it.
-    is_fine: bool,
+    /// With how many others a point shares its cell, with those, on average.
+    sharing: usize,
     middle: Vector3<f64>,
     reach: f64,
     inv_reach: f64,
@@ -64,7 +64,7 @@ impl Nearby {
     pub fn with_usual(points: &[Point3<f64>], reach: f64, usual: f64) -> Self {
         let (grid, rows, bounds) = Self::sort(points, reach, usual);
         let sorted = Sorted::new(&rows, grid);
-        Self::of(points, [reach, usual], sorted, &rows, bounds)
+        Self::of(points, [reach, usual], sorted, &rows, bounds, &|| false)
     }
 
     /// The same; `None` once `interrupted` says so.
@@ -82,7 +82,8 @@ impl Nearby {
             return None;
         }
         let sorted = Sorted::new(&rows, grid);
-        (!interrupted()).then(|| Self::of(points, [reach, usual], sorted, &rows, bounds))
+        let nearby = Self::of(points, [reach, usual], sorted, &rows, bounds, &interrupted);
+        (!interrupted()).then_some(nearby)
     }
 
     /// The grid over some points, their columns, and the box around their bulk.
@@ -100,32 +101,30 @@ impl Nearby {
         sorted: Sorted,
         rows: &[Vec<f32>; 3],
         bounds: [(f32, f32); 3],
+        interrupted: &dyn Fn() -> bool,
     ) -> Self {
-        let mut nearby = Self {
-            sorted,
-            all: None,
-            is_fine: usual < reach,
-            middle: middle(points),
-            reach,
-            inv_reach: 1.0 / reach,
-        };
-        let mut sharing = nearby.sorted.grid.sharing();
+        let sharing = sorted.grid.sharing(rows);
+        let mut nearby =
+            Self { sorted, all: None, sharing, middle: middle(points), reach, inv_reach: 1.0 / reach };
+        let mut sharing = nearby.sharing;
         if sharing > MOST_SHARED {
             let (distinct, kept) = distinct(rows);
-            nearby.is_fine = true;
             let widest = bounds.iter().map(|(low, high)| high - low).fold(f32::MIN_POSITIVE, f32::max);
             let mut cell = cell_of(reach, usual).min(widest);
             let mut grid = None;
-            while sharing > SHARED && cell > LEAST_PART * widest {
+            while sharing > SHARED && cell > LEAST_PART * widest && !interrupted() {
                 // They may fill a volume or a surface, or lie in clusters: not too narrow at once.
                 cell *= (SHARED as f32 / sharing as f32).cbrt().clamp(0.25, 0.8);
                 let finer = Grid::in_box(&distinct, bounds, cell);
-                sharing = finer.sharing();
+                sharing = finer.sharing(&distinct);
                 grid = Some(finer);
             }
             if let Some(grid) = grid {
                 let all = std::mem::replace(&mut nearby.sorted, Sorted::of(&distinct, grid, &kept));
                 nearby.all = (kept.len() < points.len()).then_some(all);
+                if nearby.all.is_none() {
+                    nearby.sharing = sharing;
+                }
             }
         }
         nearby
@@ -193,7 +192,7 @@ impl Nearby {
         const GRAIN: usize = 512;
         let radius = self.radius(distance);
         let Sorted { grid, points, .. } = self.all();
-        let total: u32 = values.iter().sum();
+        let total = values.iter().fold(0_u32, |sum, &value| sum.saturating_add(value));
         let is_crowded = self.may_hold(radius, MOST_SUMMED);
         let bounds = points.each_ref().map(|axis| min_max(&axis[..grid.order().len()]));
         let values: Vec<u32> = grid.order().iter().map(|&row| values[row as usize]).collect();
@@ -238,7 +237,7 @@ impl Nearby {
     fn may_hold(&self, radius: f32, most: usize) -> bool {
         let grid = &self.all().grid;
         let cells = (2.0 * radius / grid.cell_size() + 2.0).powi(3);
-        cells * grid.sharing() as f32 > most as f32
+        cells * self.sharing as f32 > most as f32
     }
 
     /// Whether so many points may lie within `distance` of one that not all of them should be looked at for each.
@@ -309,25 +308,30 @@ impl Nearby {
             #[inline(always)]
             |run| search.look::<false>(run, NONE),
         );
-        if self.is_fine {
-            let sure = 2.0 * columns.seen;
-            if sure < bound {
-                return search.row_within(sure).or_else(|| self.far_row(simd, q, bound));
-            }
-        }
         search.row_within(f32::INFINITY)
     }
 
-    /// What [`Self::row`] finds farther away than a cell is wide.
-    #[cold]
-    #[inline(never)]
-    fn far_row<S: Simd>(&self, simd: S, q: [f32; 3], bound: f32) -> Option<u32> {
+    /// Whether the cells around a place hold what lies within `bound` of it, and are known to the grid one and all. All is made
+    /// for that.
+    fn is_simple(&self, bound: f32) -> bool {
+        self.sorted.grid.is_dense() && bound <= 2.0 * SEEN * self.sorted.grid.cell_size()
+    }
+
+    /// [`Self::row`] where that is not so.
+    #[inline(always)]
+    #[allow(clippy::inline_always)] // compiled for the vector units of `simd`
+    fn far_row<S: Simd>(&self, simd: S, query: &Point3<f64>, bound: f32) -> Option<u32> {
+        let q = self.local(query);
+        let grid = &self.sorted.grid;
         let mut search = Search::new(simd, self.sorted.columns(), q, bound * bound);
-        let mut radius = self.sorted.first_radius(q);
+        let mut radius = SEEN * grid.cell_size() + grid.distance_to_box(q);
         loop {
-            for run in self.sorted.grid.around(q, radius.min(bound)) {
-                search.look::<false>(run, NONE);
-            }
+            grid.each_around(
+                q,
+                radius.min(bound),
+                #[inline(always)]
+                |run| search.look::<false>(run, NONE),
+            );
             if let Some(row) = search.row_within(if radius >= bound { f32::INFINITY } else { radius }) {
                 return Some(row);
             }
@@ -377,6 +381,10 @@ impl WithSimd for AnyWithinEach<'_> {
         let grid = &nearby.sorted.grid;
         let columns = nearby.sorted.columns();
         let mut any = Vec::with_capacity(queries.len());
+        if !nearby.is_simple(bound) {
+            any.extend(queries.iter().map(|query| nearby.far_row(simd, query, bound).is_some()));
+            return any;
+        }
         for query in queries {
             let q = nearby.local(query);
             let mut search = Search::new(simd, columns, q, bound * bound);
@@ -389,10 +397,6 @@ impl WithSimd for AnyWithinEach<'_> {
                     #[inline(always)]
                     |run| search.look::<false>(run, NONE),
                 );
-                if nearby.is_fine && 2.0 * columns.seen < bound && !search.has_found(bound) {
-                    any.push(nearby.far_row(simd, q, bound).is_some());
-                    continue;
-                }
             }
             any.push(search.has_found(bound));
         }
@@ -429,6 +433,12 @@ impl WithSimd for NearestEach<'_> {
     fn with_simd<S: Simd>(self, simd: S) -> Self::Output {
         let mut rows = vec![None; self.queries.len()];
         let columns = self.nearby.sorted.columns();
+        if !self.nearby.is_simple(self.bound) {
+            for (row, query) in rows.iter_mut().zip(self.queries) {
+                *row = self.nearby.far_row(simd, query, self.bound);
+            }
+            return rows;
+        }
         for (row, query) in rows.iter_mut().zip(self.queries) {
             *row = self.nearby.row(simd, columns, query, self.bound);
         }
@@ -617,11 +627,6 @@ impl Sorted {
         Self { grid, points: sorted, rows }
     }
 
-    /// A radius that reaches beyond the cells around a place, and into the box of the points.
-    fn first_radius(&self, place: [f32; 3]) -> f32 {
-        2.0 * self.grid.cell_size() + self.grid.distance_to_box(place)
-    }
-
     fn columns_of(rows: &[Vec<f32>; 3], grid: &Grid) -> [Vec<f32>; 3] {
         rows.each_ref().map(|axis| {
             let sorted = grid.order().iter().map(|&i| axis[i as usize]);
@@ -670,6 +675,9 @@ impl Sorted {
         place: [f32; 3],
         row: u32,
     ) -> Option<u32> {
+        if !self.grid.is_dense() {
+            return Some(self.nearest_other(simd, place, row));
+        }
         let mut search = Search::new(simd, columns, place, f32::INFINITY);
         for run in self.grid.block(place) {
             search.look::<true>(run, row);
@@ -779,34 +787,31 @@ impl<'a, S: Simd> Search<'a, S> {
     fn look<const SKIP: bool>(&mut self, run: Range<usize>, skip: u32) {
         let simd = self.simd;
         let mut start = run.start;
+        // Once in any case: most runs are short, and then no branch has to be guessed.
         loop {
-            let end = run.end.min(start + LONG);
-            // Once in any case: most runs are short, and then no branch has to be guessed.
-            loop {
-                for _ in 0..LANES / S::F32_LANES {
-                    let lanes = start..start + S::F32_LANES;
-                    let gap_sq = |axis: usize| {
-                        let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
-                        let gap = simd.sub_f32s(x, self.place[axis]);
-                        simd.mul_f32s(gap, gap)
-                    };
-                    let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
-                    let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
-                    let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
-                    if SKIP {
-                        let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
-                        nearer = simd.and_m32s(nearer, other);
-                    }
-                    self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
-                    self.row = simd.select_u32s(nearer, row, self.row);
-                    start += S::F32_LANES;
+            for _ in 0..LANES / S::F32_LANES {
+                let lanes = start..start + S::F32_LANES;
+                let gap_sq = |axis: usize| {
+                    let x = S::as_simd_f32s(&self.columns.points[axis][lanes.clone()]).0[0];
+                    let gap = simd.sub_f32s(x, self.place[axis]);
+                    simd.mul_f32s(gap, gap)
+                };
+                let dist_sq = simd.add_f32s(simd.add_f32s(gap_sq(0), gap_sq(1)), gap_sq(2));
+                let row = S::as_simd_u32s(&self.columns.rows[lanes]).0[0];
+                let mut nearer = simd.less_than_f32s(dist_sq, self.dist_sq);
+                if SKIP {
+                    let other = simd.not_m32s(simd.equal_u32s(row, simd.splat_u32s(skip)));
+                    nearer = simd.and_m32s(nearer, other);
                 }
-                if start >= end {
-                    break;
-                }
+                self.dist_sq = simd.select_f32s(nearer, dist_sq, self.dist_sq);
+                self.row = simd.select_u32s(nearer, row, self.row);
+                start += S::F32_LANES;
             }
-            // None is nearer than one that coincides; where so many do, the rest need not be looked at.
-            if start >= run.end || simd.reduce_min_f32s(self.dist_sq) == 0.0 {
+            if start >= run.end {
+                return;
+            }
+            // None is nearer than one that coincides: where so many do, the rest need not be looked at.
+            if SKIP && (start - run.start).is_multiple_of(LONG) && simd.reduce_min_f32s(self.dist_sq) == 0.0 {
                 return;
             }
         }
