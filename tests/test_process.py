@@ -306,7 +306,6 @@ import os, threading
 import ibi_rs as ibi
 import test_process as t
 
-how, again = sys.argv[1], sys.argv[2] == "again and again"
 scene = t.scene_of(0)
 going = threading.Event()
 
@@ -317,7 +316,7 @@ def scs(context):
     going.set()
     return context.alive
 
-def work():
+def work(how):
     if how == "callback":
         ibi.register(scene.src, scene.tgt, scene.corr, callback=callback)
     elif how == "stage":
@@ -328,28 +327,32 @@ def work():
         going.set()
         ibi.features.fpfh(scene.src, scene.src, radius=10.0)
 
-def loop():
-    work()
+def loop(how, again):
+    work(how)
     while again:
-        work()
+        work(how)
 
-for _ in range(20):
+def end(how, again):
+    # Whether this is the parent; a child comes to its end, in the middle of the work.
     child = os.fork()
     if child:
-        print(os.waitpid(child, 0)[1])
-    else:
-        if how == "register":
-            ibi._core._watch(lambda phase: going.set())
-        threading.Thread(target=loop, daemon=True).start()
-        going.wait()
-        break
+        print(how, again, os.waitpid(child, 0)[1], flush=True)
+        return True
+    if how == "register":
+        ibi._core._watch(lambda phase: going.set())
+    threading.Thread(target=loop, args=(how, again), daemon=True).start()
+    going.wait()
+    return False
+
+all(end(how, again) for how in sys.argv[1:] for again in (False, True) for _ in range(10))
 """
 
 
-@pytest.mark.parametrize("often", ["once", "again and again"])
-@pytest.mark.parametrize("how", ["callback", "stage", "register", "features"])
-def test_a_process_ends_while_a_daemon_is_at_work(how, often):
-    assert ended(python(ENDS, how, often)) == ("0\n" * 20, "", 0)
+def test_a_process_ends_while_a_daemon_is_at_work():
+    """Of 20 runs 5 aborted: a stage returned to an interpreter that was being taken apart."""
+    hows = ["callback", "stage", "register", "features"]
+    lines = [f"{how} {again} 0\n" for how in hows for again in (False, True) for _ in range(10)]
+    assert ended(python(ENDS, *hows)) == ("".join(lines), "", 0)
 
 
 LAST = """

@@ -5,6 +5,7 @@ use std::thread::ThreadId;
 use std::time::{Duration, Instant};
 
 use ibi_core::{CancelToken, Interrupt, Watcher};
+use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::PySystemExit;
 use pyo3::prelude::*;
 
@@ -18,6 +19,9 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(watch, m)?)?;
     let end = wrap_pyfunction!(end_all, m)?;
     m.py().import("atexit")?.call_method1("register", (end,))?;
+    // What the first array to be read would import is imported now: within Rust no thread may be waiting for Python, but
+    // in a run, when the process ends.
+    PyArray1::<f64>::zeros(m.py(), 1, false).try_readonly()?;
     Ok(())
 }
 
