@@ -73,9 +73,6 @@ const MOST: usize = 50_000;
 const WIDEN: f64 = 1.25;
 const FIRST_WIDTH: f64 = 2.0;
 
-/// Mean distance to the nearest other one of points of which each has a voxel of a surface.
-const SPACING_PER_WIDTH: f64 = 0.8;
-
 /// Which points of a surface the surface itself hides, as seen from far away in one of 128 directions.
 #[derive(Debug)]
 pub struct OwnShadow {
@@ -124,7 +121,7 @@ impl OwnShadow {
             let (rows, answer, width) = few(points, normals, spacing, interrupt)?;
             let kept: Vec<_> = rows.iter().map(|&row| points[row as usize]).collect();
             // Not measured: what is nearest may lie on the other side of a wall.
-            let spacing = spacing.max(SPACING_PER_WIDTH * width);
+            let spacing = spacing.max(width);
             some = Some((kept, rows.iter().map(|&row| normals[row as usize]).collect::<Vec<_>>(), spacing));
             of_all = Some(OfAll { answer, is_hidden: (0..DIRECTIONS).map(|_| OnceLock::new()).collect() });
         }
