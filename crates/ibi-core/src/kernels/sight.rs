@@ -243,7 +243,8 @@ fn hidden(
     // Where many points share a cell, those that come first are nearest to the eye, and those too far back left out.
     let depth = |q: u32| points[q as usize].coords.dot(to_eye);
     let is_crowded = |cell: usize| starts[cell + 1] - starts[cell] > CROWDED;
-    for cell in (0..shape[0] * shape[1]).filter(|&cell| is_crowded(cell)) {
+    let crowded: Vec<usize> = (0..shape[0] * shape[1]).filter(|&cell| is_crowded(cell)).collect();
+    for &cell in &crowded {
         let rows = &mut rows[starts[cell] as usize..starts[cell + 1] as usize];
         rows.sort_unstable_by(|&a, &b| depth(b).total_cmp(&depth(a)).then(a.cmp(&b)));
     }
@@ -261,7 +262,7 @@ fn hidden(
         (column.saturating_sub(1)..(column + 2).min(shape[0])).any(|x| {
             let [first, last] = [row.saturating_sub(1), (row + 2).min(shape[1])].map(|y| x * shape[1] + y);
             let run = |from: usize, to: usize| &rows[starts[from] as usize..starts[to] as usize];
-            if !(first..last).any(is_crowded) {
+            if crowded.is_empty() || !(first..last).any(is_crowded) {
                 return run(first, last).iter().any(|&q| hides(q as usize, p));
             }
             let least = depth(p as u32) + (1.0 - 1e-9) * BEFORE * spacing;
