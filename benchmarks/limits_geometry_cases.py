@@ -26,7 +26,7 @@ def places(count: int) -> np.ndarray:
 
 
 def of_ball(job: Callable[[np.ndarray], object]) -> Callable[[int], Call]:
-    """What `job` makes of so many points of a sphere."""
+    """Call `job` with so many points of a sphere."""
 
     def call_of(size: int) -> Call:
         points = ball(size)
@@ -36,10 +36,10 @@ def of_ball(job: Callable[[np.ndarray], object]) -> Callable[[int], Call]:
 
 
 def shadows(size: int) -> Call:
-    """A model that has yet to learn what it hides of itself, in a scene of one view."""
+    """Register a model that has yet to learn what it hides of itself, in a scene of one view."""
     points = ball(size) * [1.0, 0.7, 0.5]
     normals = points / np.array([1.0, 0.49, 0.25])
-    tgt, rows = points[:2000] + [3.0, 0.0, 0.0], np.arange(2000)
+    tgt, rows = points[:2000] + np.array([3.0, 0.0, 0.0]), np.arange(2000)
     eye, params = [0.0, 0.0, 20.0], ibi.Params.single_view()
 
     def call(timeout_s: float | None) -> object:
@@ -52,7 +52,7 @@ def shadows(size: int) -> Call:
 
 
 def torus(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh of about so many faces."""
+    """Make a mesh of about so many faces."""
     n = int((size / 2) ** 0.5)
     u, v = np.meshgrid(*2 * [np.arange(n) * 2 * np.pi / n], indexing="ij")
     vertices = np.stack([(2 + np.cos(v)) * np.cos(u), (2 + np.cos(v)) * np.sin(u), np.sin(v)], -1)
@@ -63,13 +63,13 @@ def torus(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh(size: int) -> Call:
-    """A model of a fine mesh: nearly all of it the outer surface."""
+    """Make a model of a fine mesh: nearly all of it the outer surface."""
     vertices, faces = torus(size)
     return lambda _: ibi.Model.from_mesh(vertices, faces)
 
 
 def slivers(size: int) -> Call:
-    """The outer surface of a cylinder whose faces are as long as it is."""
+    """Find the outer surface of a cylinder whose faces are as long as it is."""
     angle = np.arange(size // 2) * 2 * np.pi / (size // 2)
     ring, row = np.stack([np.cos(angle), np.sin(angle)], -1), np.arange(size // 2)
     vertices = np.concatenate([np.insert(ring, 2, z, axis=1) for z in (0.0, 3.0)])
@@ -83,7 +83,7 @@ def slivers(size: int) -> Call:
 
 
 def scored(size: int) -> Call:
-    """A scene scored by ADD-S: so many points, ten poses against ten."""
+    """Score a scene by ADD-S: so many points, ten poses against ten."""
     points, poses = ball(size), places(10)
     return lambda _: metrics.score_scene(poses, poses[::-1], criterion=metrics.ADD_S, model=points)
 
@@ -95,7 +95,7 @@ def matched(size: int) -> Call:
 
 
 def near(points: np.ndarray) -> object:
-    """ADD-S of a pose and one next to it."""
+    """Measure ADD-S of a pose and one next to it."""
     moved = np.eye(4)
     moved[0, 3] = 0.001
     return metrics.add_s(points, moved, np.eye(4))
