@@ -33,8 +33,9 @@ class Pose:
         Share of source points within ``d_op`` of a target point, 0 to 1.
     closeness : float
         How much closer the source lies to target points that no other pose owns than chance would put it:
-        0 as by chance, 1 perfect; below 0 if worse than by chance. In a scene seen from one side 1 is as close
-        as its own points lie to each other on average; where a part is smoother than the rest, it is more.
+        0 as by chance, 1 perfect; below 0 if worse than by chance. In a scene seen from one side 1 is as
+        close as its own points lie to each other on average; where a part is smoother than the rest, it is
+        more.
     back_fit : float
         Mean over the correspondences whose target point lies within 2 ``d_op`` of this instance, and belongs
         to no other pose, of 1 - d / 2 ``d_op``, d being that distance, 0 to 1.

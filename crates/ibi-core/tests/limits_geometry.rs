@@ -32,6 +32,7 @@ fn feature<T>(result: Result<T, FeatureError>) -> bool {
     }
 }
 
+#[allow(clippy::needless_pass_by_value, reason = "as the one above")]
 fn metric<T>(result: Result<T, MetricsError>) -> bool {
     match result {
         Err(MetricsError::Interrupted) => true,
@@ -60,6 +61,7 @@ fn poses(count: usize) -> Vec<Isometry3<f64>> {
 }
 
 /// What makes a phase long, under a name; nothing for those of a registration, which are of another table.
+#[allow(clippy::too_many_lines, reason = "a table")]
 fn jobs(phase: Phase) -> Vec<(&'static str, Job)> {
     let model = || Model::new(ball(3000)).unwrap();
     match phase {

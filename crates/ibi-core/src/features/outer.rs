@@ -358,6 +358,7 @@ fn on_screen(axes: &[Vector3<f64>; 3], origin: Point3<f64>, point: &Point3<f64>)
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use super::*;
     use crate::kernels::rng::Rng;

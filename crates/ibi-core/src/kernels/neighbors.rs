@@ -130,6 +130,7 @@ impl std::fmt::Debug for Neighbors {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests may panic")]
 mod tests {
     use super::*;
     use crate::kernels::rng::Rng;

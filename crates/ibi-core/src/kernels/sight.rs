@@ -73,9 +73,6 @@ const MOST: usize = 50_000;
 const WIDEN: f64 = 1.25;
 const FIRST_WIDTH: f64 = 2.0;
 
-/// Mean distance to the nearest other one of points of which each has a voxel of a surface.
-const SPACING_PER_WIDTH: f64 = 0.8;
-
 /// Which points of a surface the surface itself hides, as seen from far away in one of 128 directions.
 #[derive(Debug)]
 pub struct OwnShadow {
@@ -124,7 +121,7 @@ impl OwnShadow {
             let (rows, answer, width) = few(points, normals, spacing, interrupt)?;
             let kept: Vec<_> = rows.iter().map(|&row| points[row as usize]).collect();
             // Not measured: what is nearest may lie on the other side of a wall.
-            let spacing = spacing.max(SPACING_PER_WIDTH * width);
+            let spacing = spacing.max(width);
             some = Some((kept, rows.iter().map(|&row| normals[row as usize]).collect::<Vec<_>>(), spacing));
             of_all = Some(OfAll { answer, is_hidden: (0..DIRECTIONS).map(|_| OnceLock::new()).collect() });
         }
@@ -246,7 +243,8 @@ fn hidden(
     // Where many points share a cell, those that come first are nearest to the eye, and those too far back left out.
     let depth = |q: u32| points[q as usize].coords.dot(to_eye);
     let is_crowded = |cell: usize| starts[cell + 1] - starts[cell] > CROWDED;
-    for cell in (0..shape[0] * shape[1]).filter(|&cell| is_crowded(cell)) {
+    let crowded: Vec<usize> = (0..shape[0] * shape[1]).filter(|&cell| is_crowded(cell)).collect();
+    for &cell in &crowded {
         let rows = &mut rows[starts[cell] as usize..starts[cell + 1] as usize];
         rows.sort_unstable_by(|&a, &b| depth(b).total_cmp(&depth(a)).then(a.cmp(&b)));
     }
@@ -264,7 +262,7 @@ fn hidden(
         (column.saturating_sub(1)..(column + 2).min(shape[0])).any(|x| {
             let [first, last] = [row.saturating_sub(1), (row + 2).min(shape[1])].map(|y| x * shape[1] + y);
             let run = |from: usize, to: usize| &rows[starts[from] as usize..starts[to] as usize];
-            if !(first..last).any(is_crowded) {
+            if crowded.is_empty() || !(first..last).any(is_crowded) {
                 return run(first, last).iter().any(|&q| hides(q as usize, p));
             }
             let least = depth(p as u32) + (1.0 - 1e-9) * BEFORE * spacing;
