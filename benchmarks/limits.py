@@ -10,8 +10,9 @@ run again with an end: by `timeout_s`, where there is one, and by a signal whose
 does. Both come after several shares of the time that the whole takes, 0.5 s at most. `late` is how much later
 the call was back, at worst.
 
-A case is one line in `CASES`; a new one needs a function that makes a call of a size. On a busy machine
-`--cpu` counts the seconds of the processor, of all threads, for the growth.
+A case is one line in `CASES` or, outside of the rounds, in limits_geometry_cases.py; a new one needs a
+function that makes a call of a size. On a busy machine `--cpu` counts the seconds of the processor, of all
+threads, for the growth.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import ibi_rs as ibi
 import numpy as np
 from frame import cli, records, timing
 from frame.tables import show
+from limits_geometry_cases import ROWS
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 LONGEST_S = 0.5
@@ -275,7 +277,7 @@ def main() -> None:
     fields = ["case", "size", "seconds", "exponent", "late_by_signal", "late_by_timeout"]
     print(f"{'case':28s}  {'size':>8s}  {'seconds':>8s}  exponent  late by signal, by timeout")
     record = []
-    for case in CASES:
+    for case in [*CASES, *(Case(*row) for row in ROWS)]:
         if args.only not in case.name:
             continue
         for row in run(case, args.repeats, args.longest, clock):

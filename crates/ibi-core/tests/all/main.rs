@@ -24,6 +24,7 @@ mod hough3d;
 mod joint;
 mod kernels;
 mod limits;
+mod limits_geometry;
 mod mock;
 mod nearby;
 mod nnsr;

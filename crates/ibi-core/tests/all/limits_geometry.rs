@@ -1,5 +1,4 @@
 //! Limits outside of the rounds: each phase ends when it is asked to, wherever it is; and what bounds its time is right.
-#![allow(clippy::unwrap_used, reason = "tests may panic")]
 
 use std::sync::{Arc, Mutex};
 
