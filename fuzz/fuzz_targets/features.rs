@@ -75,7 +75,9 @@ fn features(u: &mut Unstructured<'_>) -> Result<()> {
                 // So many at most: the number follows from an area of any size.
                 Amount::Spacing(number(u)?.abs().max(0.05))
             };
-            if let Ok(sampled) = sample_mesh(&mesh, amount, u.arbitrary()?, &never) {
+            if let Ok(sampled) = sample_mesh(&mesh, amount, u.arbitrary()?, &never)
+                && sampled.points.len() < 2000
+            {
                 let views = Views::default();
                 let _ = outer_surface(&sampled.points, &sampled.normals, &mesh, &views, &never);
             }
