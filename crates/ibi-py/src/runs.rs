@@ -16,7 +16,8 @@ const LAST_WAIT: Duration = Duration::from_secs(10);
 const SIGNAL_PERIOD: Duration = Duration::from_millis(20);
 
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(watch, m)?)?;
+    // Not by `add_function`, which would list it in `__all__`.
+    m.setattr("_watch", wrap_pyfunction!(watch, m)?)?;
     let end = wrap_pyfunction!(end_all, m)?;
     m.py().import("atexit")?.call_method1("register", (end,))?;
     // What the first array to be read would import is imported now: within Rust no thread may be waiting for Python, but
