@@ -7,6 +7,8 @@ from typing import get_args
 import ibi_rs as ibi
 import numpy as np
 import pytest
+from ibi_rs._inputs import _scan
+from ibi_rs._nearest import BLOCK, nearest_rows
 from ibi_rs.variants import Ce, Scs, Te
 
 SCENE = ibi.synth.outlier_layout(
@@ -487,3 +489,68 @@ def test_finding_nothing_is_an_answer(given, reason, params, capfd):
     if found.stop_reason.name != "stalled":
         assert found.stop_reason.value < found.stop_reason.threshold
     assert capfd.readouterr() == ("", "")
+
+
+# Scans, as cameras write them ----------------------------------------------------------------------------
+
+IMAGE = np.arange(60.0).reshape(4, 5, 3)
+UP = np.tile([0.0, 0.0, 2.0], (4, 5, 1))
+ORGANISED = {
+    name: LAYOUTS[name] for name in ("lists", "tuples", "list of arrays", "Fortran order", "read-only")
+}
+ORGANISED |= {
+    name: LAYOUTS[name] for name in ("big-endian", "__array__", "__dlpack__", "torch", "memoryview")
+}
+
+
+@pytest.mark.parametrize("form", ORGANISED.values(), ids=ORGANISED)
+def test_organised_scans_are_taken_in_any_form(form):
+    holed = put(put(IMAGE, (0, 1, 2), NAN), (3, 3), INF)
+    points, normals, num_dropped = _scan("tgt", form(holed), form(UP))
+    assert points.tolist() == np.delete(IMAGE.reshape(-1, 3), [1, 18], axis=0).tolist()
+    assert (normals.tolist(), num_dropped) == ([[0, 0, 2]] * 18, 2)
+
+
+@pytest.mark.parametrize("missing", [[0, 0, 0], [NAN, NAN, NAN], [0, INF, 1]])
+def test_a_normal_that_is_missing_is_that_of_the_nearest_point(missing):
+    """A point is a point, whatever its normal."""
+    normals = np.tile([1.0, 0, 0], (20, 1))
+    normals[[4, 6]] = missing
+    normals[7] = [0, 1, 0]
+    points = np.arange(20.0)[:, None] ** 2 * [1.0, 0, 0]
+    points[6] = [48, 0, 0]
+    held, of_points, num_dropped = _scan("tgt", points, normals)
+    assert (held.tolist(), num_dropped) == (points.tolist(), 0)
+    assert of_points[[4, 6]].tolist() == [[1, 0, 0], [0, 1, 0]]
+    assert np.array_equal(normals[4], missing, equal_nan=True)  # those of the caller are as they were
+    normals[:11] = missing
+    with pytest.raises(
+        ibi.InputError, match="tgt_normals: 11 of 20 are 0 or not finite; leave tgt_normals out"
+    ):
+        _scan("tgt", points, normals)
+
+
+@pytest.mark.parametrize(
+    ("points", "normals", "pattern"),
+    [
+        (IMAGE[..., :2], None, r"tgt has shape \(4, 5, 2\); it must be \(N, 3\) or \(H, W, 3\)"),
+        (IMAGE[None], None, r"tgt has shape \(1, 4, 5, 3\)"),
+        (IMAGE, UP[:1], r"tgt_normals has 5 rows; it must have one for each of the 20 rows of tgt"),
+        (IMAGE, UP[..., 0], r"tgt_normals has shape \(4, 5\)"),
+    ],
+)
+def test_what_is_no_scan_is_refused(points, normals, pattern):
+    with pytest.raises(ibi.InputError, match="^" + pattern):
+        _scan("tgt", points, normals)
+
+
+@pytest.mark.parametrize("num_points", [1, 2, 100, 3 * BLOCK])
+@pytest.mark.parametrize("stretch", [(1, 1, 1), (0, 5, 0), (0, 0, 0), (1e-3, 1, 9)])
+def test_the_nearest_points_are_the_nearest(num_points, stretch):
+    rng = np.random.default_rng(num_points)
+    points = rng.normal(size=(num_points, 3)) * stretch + 1000
+    queries = rng.normal(size=(2 * BLOCK + 7, 3)) * (2 * np.array(stretch) + 0.1) + 1000
+    found = np.linalg.norm(points[nearest_rows(points, queries)] - queries, axis=1)
+    for block in np.array_split(np.arange(len(queries)), 30):
+        least = np.linalg.norm(points[None] - queries[block, None], axis=2).min(axis=1)
+        np.testing.assert_allclose(found[block], least, rtol=1e-5)

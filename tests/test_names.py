@@ -35,7 +35,7 @@ CASES = [
     (lambda: register(np.array(None)), TypeError, "corr has dtype object"),
     (lambda: detect(tgt_normals=5), ibi.InputError, "tgt_normals has shape ()"),
     (lambda: detect(tgt_normals=np.ones((3, 3))), ibi.InputError, "tgt_normals has 3 rows"),
-    (lambda: detect(tgt_normals=np.zeros((N, 3))), ibi.InputError, "tgt_normals[0] has length 0"),
+    (lambda: detect(tgt_normals=np.zeros((N, 3))), ibi.InputError, "tgt_normals: 3815 of 3815 are 0"),
     (lambda: detect(remove_plane="no"), TypeError, "remove_plane must be a bool or None, not str"),
     (lambda: detect(remove_plane=0), TypeError, "remove_plane must be a bool or None, not int"),
     (lambda: detect(num_threads="two"), ValueError, "num_threads is 'two'; it must be an integer"),

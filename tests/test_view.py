@@ -116,7 +116,11 @@ def test_bad_views_are_refused_by_name(call, message):
 
 
 def test_points_that_are_not_finite_were_not_measured():
-    assert len(ibi.View(CAMERA, [[0, 0, 1], [np.nan, 0, 1], [0, np.inf, 1]]).points) == 1
+    view = ibi.View(CAMERA, [[0, 0, 1], [np.nan, 0, 1], [0, np.inf, 1]])
+    assert (len(view.points), view.num_dropped) == (1, 2)
+    view = ibi.View.from_depth([[0, np.nan, 1], [np.inf, 2, -1]], 1, 1, 0, 0)
+    assert (len(view.points), view.num_dropped) == (2, 4)
+    assert pickle.loads(pickle.dumps(view)).num_dropped == 4
 
 
 def test_organised_points_are_taken():

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs._core import InputError
+from ibi_rs._nearest import nearest_rows
 
 Points = Any
 """(N, 3) real numbers, or an object with ``.points``, ``.vertices``, ``__array__`` or ``__dlpack__``."""
@@ -46,17 +47,21 @@ def _aligned(array: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
 
 def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
     """(N, 3) float64, from an array or from an object that holds one."""
+    array = _held(name, value)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
+    return _aligned(array, np.float64)
+
+
+def _held(name: str, value: Any) -> npt.NDArray[Any]:
+    """Take the points out of what holds some, in any shape; (0, 3) if there are none."""
     if not isinstance(value, np.ndarray):
         for attribute in ("points", "vertices"):
             value = getattr(value, attribute, value)
         for attribute in ("point", "vertex"):  # Open3D's tensor geometry
             value = getattr(getattr(value, attribute, None), "positions", value)
     array = _real(name, value)
-    if array.shape == (0,):
-        array = array.reshape(0, 3)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
-    return _aligned(array, np.float64)
+    return array.reshape(0, 3) if array.shape == (0,) else array
 
 
 _FARTHEST = 1e150
@@ -72,13 +77,9 @@ def _scan_points(name: str, value: Any) -> tuple[npt.NDArray[np.float64], int]:
 def _scan(
     name: str, points: Any, normals: Any
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None, int]:
-    """Points and normals of a scan, as `_scan_points`: a row of which either is not finite goes."""
-    if isinstance(points, np.ndarray) and points.ndim == 3:
-        points = points.reshape(-1, points.shape[-1])
-    if isinstance(normals, np.ndarray) and normals.ndim == 3:
-        normals = normals.reshape(-1, normals.shape[-1])
-    held = _points(name, points)
-    of_points = None if normals is None else _points(f"{name}_normals", normals)
+    """Points and normals of a scan, as `_scan_points`; who has no normal gets that of its nearest point."""
+    held = _scan_rows(name, points)
+    of_points = None if normals is None else _scan_rows(f"{name}_normals", normals)
     if of_points is not None and len(of_points) != len(held):
         raise InputError(
             f"{name}_normals has {len(of_points)} rows; it must have one for each of the {len(held)} rows of"
@@ -88,15 +89,48 @@ def _scan(
     if len(beyond):
         raise InputError(f"{name} has a coordinate of {beyond[0]:g}; {_FARTHEST:g} is the largest allowed")
     finite = np.isfinite(held).all(axis=1)
-    if of_points is not None:
-        finite &= np.isfinite(of_points).all(axis=1)
-        without = np.nonzero(~of_points.any(axis=1))[0]
-        if len(without):
-            raise InputError(f"{name}_normals[{without[0]}] has length 0; a normal must have a direction")
     num_dropped = len(held) - int(finite.sum())
     if num_dropped:
         held, of_points = held[finite], None if of_points is None else of_points[finite]
+    if of_points is not None:
+        of_points, num_missing = _completed(held, of_points)
+        if of_points is None:
+            raise InputError(
+                f"{name}_normals: {num_missing} of {len(held)} are 0 or not finite; leave {name}_normals out"
+            )
     return held, of_points, num_dropped
+
+
+def _scan_rows(name: str, value: Any) -> npt.NDArray[np.float64]:
+    """(N, 3) float64 of what is (N, 3) or (H, W, 3)."""
+    array = _held(name, value)
+    if array.ndim == 3 and array.shape[-1] == 3:
+        array = array.reshape(-1, 3)
+    elif array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3) or (H, W, 3)")
+    return _aligned(array, np.float64)
+
+
+_MOST_WITHOUT_NORMAL = 0.5
+"""Where more of the points have none, those of the others tell nothing about them."""
+
+
+def _completed(
+    points: npt.NDArray[np.float64], normals: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64] | None, int]:
+    """Give a point without a normal that of its nearest one, unless most have none; and how many had none.
+
+    Estimators write 0 or NaN where they know none.
+    """
+    is_missing = ~(np.isfinite(normals).all(axis=1) & normals.any(axis=1))
+    num_missing = int(np.count_nonzero(is_missing))
+    if num_missing == 0:
+        return normals, 0
+    if num_missing > _MOST_WITHOUT_NORMAL * len(normals):
+        return None, num_missing
+    normals = normals.copy()
+    normals[is_missing] = normals[~is_missing][nearest_rows(points[~is_missing], points[is_missing])]
+    return normals, num_missing
 
 
 RIGID_TOLERANCE = 1e-6
@@ -125,7 +159,7 @@ def _mesh(vertices: Any, faces: Any) -> tuple[npt.NDArray[np.float64], npt.NDArr
     """(V, 3) and (F, 3), from arrays or from an object that holds both."""
     if faces is None:
         if hasattr(vertices, "geometry") and hasattr(vertices, "dump"):  # a Scene of trimesh
-            parts = vertices.dump()
+            parts = [part for part in vertices.dump() if len(getattr(part, "faces", ()))]
             counts = np.cumsum([0, *(len(part.vertices) for part in parts)])
             faces = [np.asarray(part.faces) + start for part, start in zip(parts, counts, strict=False)]
             faces = np.concatenate(faces) if faces else None

@@ -511,8 +511,9 @@ class Model:
             out.
         params : Params, optional
             By default ``Params.single_view()`` with a viewpoint and ``Params()`` without one.
-        tgt_normals : (N, 3) array_like, optional
-            Outwards. By default they are estimated, and face the viewpoint.
+        tgt_normals : (N, 3) or (H, W, 3) array_like, optional
+            Outwards. By default they are estimated, and face the viewpoint. A point whose normal is 0 or not
+            finite gets that of its nearest point; where most are, they are refused.
         viewpoint : (3,) array_like or View
             Where the depth camera stood, in the frame of ``tgt``: ``[0, 0, 0]`` for most scans. Where ``tgt``
             is not all that it measured, a :class:`View` of all. It may be left out where normals are given,

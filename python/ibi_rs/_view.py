@@ -25,6 +25,8 @@ class View:
         Where the camera stood, in the frame of the scene, data units.
     points : (N, 3) float64
         All that it measured, in the frame of the scene, data units. Without the points that are not finite.
+    num_dropped : int
+        How many were not finite, or pixels without a depth.
 
     Examples
     --------
@@ -36,14 +38,16 @@ class View:
 
     eye: npt.NDArray[np.float64]
     points: npt.NDArray[np.float64]
+    num_dropped: int
 
     def __init__(self, eye: npt.ArrayLike, points: Any) -> None:
         place = np.array(_viewpoint(eye))
         if not np.isfinite(place).all():
             raise _core.InputError(f"viewpoint is {place.tolist()}; it must be finite")
-        held, _ = _scan_points("viewpoint.points", points)
+        held, num_dropped = _scan_points("viewpoint.points", points)
         object.__setattr__(self, "eye", _frozen(place))
         object.__setattr__(self, "points", _frozen(held.copy()))
+        object.__setattr__(self, "num_dropped", num_dropped)
 
     @classmethod
     def from_depth(
@@ -87,10 +91,13 @@ class View:
         points = depth_points(image, *_intrinsics(fx, fy, cx, cy))
         if len(points) == 0:
             raise _core.InputError("depth: no pixel has one")
-        if target_from_camera is None:
-            return cls(np.zeros(3), points)
-        motion = _rigid("target_from_camera", target_from_camera)
-        return cls(motion[:3, 3], points @ motion[:3, :3].T + motion[:3, 3])
+        eye = np.zeros(3)
+        if target_from_camera is not None:
+            motion = _rigid("target_from_camera", target_from_camera)
+            eye, points = motion[:3, 3], points @ motion[:3, :3].T + motion[:3, 3]
+        view = cls(eye, points)
+        object.__setattr__(view, "num_dropped", image.size - len(points))
+        return view
 
     def __repr__(self) -> str:
         eye = ", ".join(np.format_float_positional(x + 0.0, 9, trim="-") for x in self.eye.round(9))
