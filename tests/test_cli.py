@@ -570,7 +570,7 @@ def test_a_batch_writes_what_register_does_and_tells_what_failed(scans, tmp_path
     options = ["-o", poses, "--bop", bop, "--obj-id", 9, "--max-instances", 2]
     result = run("batch", MESH, *scans, *options)
     assert result.exit_code == 1
-    assert result.stderr == f"ibi: {scans[1]}: cannot be read: Not a ply file!\n"
+    assert result.stderr == f"ibi: {scans[1]}: is no PLY file\n"
     assert "4 found in 3 scans, 1 of which failed" in result.stdout
 
     assert run("register", MESH, scans[0], "-o", tmp_path / "one.json", "--max-instances", 2).exit_code == 0
@@ -761,7 +761,7 @@ def test_what_ends_a_batch_leaves_what_is_done(done, number, code):
     watchdog = threading.Timer(LIMIT_S, child.kill)
     watchdog.start()
     try:
-        assert "bad.ply: cannot be read" in child.stderr.readline()
+        assert "bad.ply: is no PLY file" in child.stderr.readline()
         child.send_signal(number)
         stdout, stderr = child.communicate()
     finally:

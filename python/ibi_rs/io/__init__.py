@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs import _core
 from ibi_rs._core import InputError
-from ibi_rs._inputs import _number
+from ibi_rs._inputs import _completed, _number
 from ibi_rs._view import _intrinsics, depth_points
 
-from . import _arrays, _clouds, _meshes, _text
+from . import _arrays, _clouds, _meshes, _ply, _text
 from ._files import Floats, PathLike, Rows, extra, reading
 
 __all__ = ["Scan", "read_cloud", "read_depth", "read_mesh", "read_scan", "read_viewpoint"]
@@ -32,9 +31,6 @@ _READERS: dict[str, Callable[[Path], Rows]] = {
     ".npy": _arrays.npy,
     ".npz": _arrays.npz,
 }
-
-_MOST_WITHOUT_NORMAL = 0.5
-"""A file in which more of the points have none gives none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +45,8 @@ class Scan:
         Of any length but 0. A point that has none in a file in which most have one gets that of its nearest
         point.
     viewpoint : (3,) float64 or None
-        Where the camera stood in the frame of the points, if the file says so (PCD's ``VIEWPOINT``).
+        Where the camera stood in the frame of the points, if the file says so: PCD's ``VIEWPOINT``, the
+        element ``camera`` of a PLY file, an array ``viewpoint`` of an NPZ file.
     num_dropped : int
         How many points were not finite.
     """
@@ -122,8 +119,9 @@ def read_scan(path: PathLike) -> Scan:
         A text file has a point a line, its columns apart by spaces, tabs, ``,`` or ``;``. Where a line names
         the columns, ``x, y, z`` and ``nx, ny, nz`` (or ``normal_x`` ...) are taken, in any order. Where none
         does, the first three are, and the next three are normals if they are of length 1; intensities and
-        colours are left out. An NPY file holds (N, 3) or (N, 6) numbers, likewise; an NPZ file ``points`` (or
-        ``tgt``) and perhaps ``normals``. No file may hold more than 2^27 points.
+        colours are left out. An NPY file holds (N, 3), (N, 6) or (H, W, 3) numbers, likewise; an NPZ file
+        ``points`` (or ``tgt``) and perhaps ``normals`` and ``viewpoint``. No file may hold more than 2^27
+        points, and none of more than 64 MiB may unpack to more than a hundred times what it takes.
 
     Returns
     -------
@@ -158,7 +156,9 @@ def read_viewpoint(path: PathLike) -> Floats | None:
         The file cannot be read.
     """
     path = Path(path)
-    return reading(path, lambda: _clouds.viewpoint(path)) if path.suffix.lower() == ".pcd" else None
+    readers = {".pcd": _clouds.viewpoint, ".ply": _ply.viewpoint, ".npz": _arrays.viewpoint}
+    read = readers.get(path.suffix.lower())
+    return None if read is None else reading(path, lambda: read(path))
 
 
 def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:
@@ -177,23 +177,8 @@ def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:
     if len(points) == 0:
         raise InputError(f"{path}: no points")
     if normals is not None:
-        normals = _completed(points, normals)
+        normals = _completed(points, normals)[0]
     return Scan(points, normals, rows.viewpoint, int((~finite).sum()))
-
-
-def _completed(points: Floats, normals: Floats) -> Floats | None:
-    """Writers give 0 or NaN where they know no normal."""
-    is_missing = ~(np.isfinite(normals).all(axis=1) & (np.abs(normals).max(axis=1) > 0))
-    if not is_missing.any():
-        return normals
-    if is_missing.mean() > _MOST_WITHOUT_NORMAL:
-        return None
-    # A match of positions is a search for the nearest.
-    have = np.nonzero(~is_missing)[0]
-    centred = (points - points.mean(axis=0)).astype(np.float32)
-    pairs, _ = _core.features_match(centred[have], centred[is_missing], 1, False, None, None)
-    normals[np.nonzero(is_missing)[0][pairs[:, 1]]] = normals[have[pairs[:, 0]]]
-    return normals
 
 
 def read_depth(
@@ -234,7 +219,10 @@ def read_depth(
     def read() -> tuple[npt.NDArray[Any], bool]:
         with extra("PIL.Image").open(path) as image:
             # Some versions of Pillow hold the 16 bits of a PNG in 32.
-            return np.asarray(image), image.format == "PNG" or image.mode.startswith("I;16")
+            has_16_bits = (image.format == "PNG" and image.mode != "L") or image.mode.startswith("I;16")
+            if image.mode in ("1", "P"):
+                raise InputError(f"has pixels of mode {image.mode}, which are no depths")
+            return np.asarray(image), has_16_bits
 
     depth, has_16_bits = reading(path, read)
     if depth.ndim != 2:

@@ -51,7 +51,10 @@ def reading(path: Path, read: Callable[[], T]) -> T:
         raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except PermissionError:
         raise InputError(f"{path}: may not be read") from None
-    except Exception as error:  # readers raise whatever the garbage in a file leads them to
+    # Readers raise whatever the garbage in a file leads them to; a panic of Rust is no Exception.
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         reason = str(error).strip().splitlines()
         raise InputError(
             f"{path}: cannot be read: {reason[0] if reason else type(error).__name__}"
@@ -73,6 +76,24 @@ def check_count(said: int, held: int, what: str) -> None:
     """Refuse a file of which a part is missing."""
     if held < said:
         raise InputError(f"the header says {said} {what}, and {held} are there; the file is cut")
+
+
+def check_rows(said: int, held: int, what: str) -> None:
+    """Refuse a file that holds fewer or more than it says."""
+    check_count(said, held, what)
+    if held > said:
+        raise InputError(f"the header says {said} {what}, and {held} are there")
+
+
+def place(said: Any) -> Floats:
+    """Three numbers that say where the camera stood."""
+    try:
+        numbers = np.asarray(said, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise InputError(f"its viewpoint is {str(said)[:80]}; it must be three finite numbers")
+    return numbers
 
 
 def check_most(count: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,11 @@ ROWS_THAT_COUNT = 8
 
 def read(path: Path) -> Rows:
     """Read XYZ, TXT, PTS or CSV."""
-    lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    lines = _decoded(path.read_bytes()).splitlines()
     layout = _layout(lines)
     body = [line for line in lines[layout.first :] if line.strip() and not line.lstrip().startswith(COMMENTS)]
+    if any(mark in line for mark in COMMENTS for line in body[:1]):
+        body = [_without_comment(line) for line in body]
     check_most(len(body))
     if layout.count is not None:
         check_count(layout.count, len(body), "points")
@@ -32,6 +35,24 @@ def read(path: Path) -> Rows:
         body = [line.rstrip().removesuffix(layout.delimiter) for line in body]
     table = np.loadtxt(body, delimiter=layout.delimiter, ndmin=2) if body else np.empty((0, 3))
     return _named(table, layout.names) if layout.names is not None else _unnamed(table)
+
+
+def _decoded(data: bytes) -> str:
+    for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
+        if data.startswith(mark):
+            return data.decode(encoding)
+    if b"\0" in data:
+        raise InputError("is no text")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:  # names and comments of another encoding; numbers are the same in all
+        return data.decode("latin-1")
+
+
+def _without_comment(line: str) -> str:
+    for mark in COMMENTS:
+        line = line.split(mark)[0]
+    return line
 
 
 @dataclass(frozen=True)
@@ -53,7 +74,7 @@ def _layout(lines: list[str]) -> _Layout:
         if not stripped:
             continue
         is_comment = stripped.startswith(COMMENTS)
-        words = _words(stripped.lstrip("#/%"))
+        words = _words(stripped.lstrip("#/%") if is_comment else _without_comment(stripped))
         if is_comment or not all(map(_is_number, words)):
             found = [_name(word) for word in words]
             if set(AXES) <= set(found) or not is_comment:
@@ -66,8 +87,14 @@ def _layout(lines: list[str]) -> _Layout:
         if len(words) == 1 and words[0].isdecimal() and count is None:
             count = int(words[0])
             continue
-        delimiter = ";" if ";" in stripped else "," if "," in stripped else None
-        return _Layout(at, names, count, delimiter, delimiter == ";" and "," in stripped)
+        delimiter = next((mark for mark in (";", ",", "\t") if mark in line.rstrip()), None)
+        if delimiter == "," and "\t" in stripped:
+            delimiter = "\t"
+        if delimiter == "\t" and len(stripped.split()) != stripped.count("\t") + 1:
+            if "" in stripped.split("\t"):
+                raise InputError(f"line {at + 1} has an empty cell between two tabs")
+            delimiter = None
+        return _Layout(at, names, count, delimiter, delimiter in (";", "\t") and "," in stripped)
     return _Layout(len(lines), names, count, None, False)
 
 
@@ -89,6 +116,7 @@ def _is_number(word: str) -> bool:
 def _name(word: str) -> str:
     """x, y, z, nx, ny, nz, however a program writes them; other words as they are."""
     word = word.lower().strip(" \"'")
+    word = re.sub(r"(?<=[xyz])_(mm|cm|dm|m|um|in|inch|ft)$", "", word)
     if match := re.fullmatch(r"(points?|normals?)[:_ ]?([012xyz])", word):
         kind, axis = match.groups()
         axis = AXES[int(axis)] if axis.isdecimal() else axis
