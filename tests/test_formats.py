@@ -174,6 +174,22 @@ REFUSED = [
     ("chunks.laz", with_numbers("laz", "I", [(LAZ_TABLE + 4, 2**31)]), CUT.format("chunks")),
     ("table.laz", with_numbers("laz", "q", [(LAZ_START, 2**60)]), "the table of its chunks is not there"),
     ("nowhere.laz", with_numbers("laz", "q", [(LAZ_START, -1)]), "the table of its chunks is not there"),
+    (
+        "empty.laz",
+        with_numbers("laz", "I", [(las("laz").find(b"laszip encoded") + 64, 0)]),
+        "chunks hold 0 points",
+    ),
+    (
+        "vast.laz",
+        with_numbers("laz", "I", [(las("laz").find(b"laszip encoded") + 64, 3 * 10**9)]),
+        "chunks hold 3",
+    ),
+    (
+        "items.laz",
+        with_numbers("laz", "H", [(las("laz").find(b"laszip encoded") + 84, 0)]),
+        "points take 0 bytes, and 34",
+    ),
+    ("name.laz", las("laz").replace(b"laszip encoded", b"laszip mislaid"), "has no record of LASzip"),
     ("points.laz", with_numbers("laz", "Q", [(247, 10**6)]), CUT.format("points")),
     (
         "zeros.npz",

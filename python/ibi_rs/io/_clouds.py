@@ -18,6 +18,12 @@ LZF_RATIO = 264
 """No three bytes of LZF hold more."""
 LAZ_POINTS_PER_BYTE = 1000
 """More than LASzip makes of points that are all the same."""
+CHUNK_SIZE_AT = 64
+"""Bytes from the name of LASzip's record on."""
+VARYING = 2**32 - 1
+"""A table says how many points each chunk holds."""
+MAX_CHUNK = 2**24
+"""LASzip's own is 50,000; lazrs makes room for so many points at once, for each thread."""
 LAS_POINTS_AT_ONCE = 1_000_000
 """Between these Ctrl-C is heard."""
 
@@ -112,10 +118,12 @@ def _pcd_text(path: Path, start: int, said: int, fields: list[str], counts: list
 def las(path: Path) -> Rows:
     """Read a LAS or LAZ file."""
     reader = extra("laspy")
-    said = _check_las(path)
+    said, varies = _check_las(path)
+    # One thread makes no room for what a table says of a chunk, and a table cannot be checked before.
+    backend = reader.LazBackend.Lazrs if varies else None
     parts = [np.empty((0, 3))]
     # What stands after the points is not looked at: its length may be any number.
-    with reader.open(path, read_evlrs=False) as file:
+    with reader.open(path, read_evlrs=False, laz_backend=backend) as file:
         for part in file.chunk_iterator(LAS_POINTS_AT_ONCE):
             parts.append(np.column_stack([part.x, part.y, part.z]))
     points = np.concatenate(parts)
@@ -123,7 +131,8 @@ def las(path: Path) -> Rows:
     return Rows(points)
 
 
-def _check_las(path: Path) -> int:
+def _check_las(path: Path) -> tuple[int, bool]:
+    """Return how many points the header says, and whether a table of chunks says how many each holds."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(375)
@@ -140,16 +149,26 @@ def _check_las(path: Path) -> int:
     check_most(said)
     most = LAZ_POINTS_PER_BYTE * (size - start) if is_compressed else (size - start) // row
     check_count(said, most, "points")
-    if is_compressed and said > 0:
-        _check_chunks(path, start, row)
-    return int(said)
+    varies = is_compressed and said > 0 and _check_chunks(path, start, row)
+    return int(said), varies
 
 
-def _check_chunks(path: Path, start: int, row: int) -> None:
+def _check_chunks(path: Path, start: int, row: int) -> bool:
     """Refuse a table of more chunks than the file can hold: lazrs makes room for all, or ends the process."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(start)
+        records = file.read(start)
+        at = records.find(b"laszip encoded") + CHUNK_SIZE_AT
+        if not CHUNK_SIZE_AT <= at <= len(records) - 22:
+            raise InputError("has no record of LASzip")
+        (chunk,) = struct.unpack_from("<I", records, at)
+        (num_items,) = struct.unpack_from("<H", records, at + 20)
+        items = records[at + 22 : at + 22 + 6 * num_items]
+        widths = [width for _, width, _ in struct.iter_unpack("<3H", items[: len(items) // 6 * 6])]
+        if sum(widths) != row:
+            raise InputError(f"says that its points take {sum(widths)} bytes, and {row}")
+        if chunk != VARYING and not 0 < chunk <= MAX_CHUNK:
+            raise InputError(f"says that its chunks hold {chunk} points; 1 to {MAX_CHUNK} are allowed")
         (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
         if table == -1:  # written by what cannot go back: it is at the end
             file.seek(size - 8)
@@ -160,3 +179,4 @@ def _check_chunks(path: Path, start: int, row: int) -> None:
         _, num_chunks = struct.unpack("<II", file.read(8))
     # A chunk begins with a whole point.
     check_count(num_chunks, (table - start - 8) // row, "chunks")
+    return bool(chunk == VARYING)
