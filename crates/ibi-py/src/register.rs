@@ -275,7 +275,9 @@ pub(crate) fn rows3<T>(
 }
 
 /// The rows of a C-contiguous array.
-fn rows<'a, const N: usize, T: numpy::Element>(array: &'a PyReadonlyArray2<'_, T>) -> PyResult<&'a [[T; N]]> {
+pub(crate) fn rows<'a, const N: usize, T: numpy::Element>(
+    array: &'a PyReadonlyArray2<'_, T>,
+) -> PyResult<&'a [[T; N]]> {
     let array = array.as_array();
     if array.ncols() != N {
         return Err(InputError::new_err(format!("expected {N} columns, got {}", array.ncols())));

@@ -187,7 +187,7 @@ fn jobs(phase: Phase) -> Vec<(&'static str, Job)> {
                 let (model, [a, b]) = (Model::new(ball(9000)).unwrap(), [0, 1].map(|k| poses(2)[k]));
                 Box::new(move |interrupt| metric(model.add_s(&a, &b, interrupt)))
             }),
-            ("add_s with trees to be built", {
+            ("add_s by discs to be built", {
                 let cloud = ball(140_000);
                 let near = Isometry3::translation(1e-4, 0.0, 0.0);
                 Box::new(move |interrupt| {
