@@ -217,7 +217,7 @@ mod tests {
                 let least = points.iter().map(|p| (p - place).norm_squared()).fold(f64::INFINITY, f64::min);
                 let (dist_sq, at) = discs.nearest(&place, near);
                 near = at;
-                prop_assert_eq!(dist_sq, least);
+                prop_assert_eq!(dist_sq.to_bits(), least.to_bits());
                 let (point, row) = discs.points()[at];
                 prop_assert_eq!(point, points[row as usize]);
             }
