@@ -50,7 +50,9 @@ impl Source {
         if let Some(symmetries) = symmetries {
             cloud = cloud.with_symmetries(symmetries.0.clone());
         }
-        let prepared = in_background(py, |_, _| PreparedCloud::source(&cloud).map_err(|e| to_py_err(&e)))?;
+        let prepared = in_background(py, |cancel, _| {
+            PreparedCloud::source_until(&cloud, &runs::watched(cancel)).map_err(|e| to_py_err(&e))
+        })?;
         Ok(Self(Arc::new(prepared)))
     }
 
