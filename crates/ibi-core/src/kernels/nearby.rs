@@ -450,9 +450,9 @@ impl WithSimd for NearestEach<'_> {
 ///
 /// [`mean_spacing`] to the bit, unless
 ///
-/// - more than [`FEW_TWINS`] of the points have a twin: one nearer than the points of a straight line could be, were they
-///   as many and as far spread, by a factor of [`TWIN`]. Then one of each set of twins counts.
-/// - points that lie more than [`STRAY`] times the median off would more than double it: far pixels of a depth camera.
+/// - more than `FEW_TWINS` of the points have a twin: one nearer than the points of a straight line could be, were they
+///   as many and as far spread, by a factor of `TWIN`. Then one of each set of twins counts.
+/// - points that lie more than `STRAY` times the median off would more than double it: far pixels of a depth camera.
 ///   They do not count.
 ///
 /// 0 if all points coincide.
