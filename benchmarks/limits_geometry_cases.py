@@ -115,6 +115,6 @@ ROWS: list[tuple[str, Callable[[int], Call], tuple[int, ...], bool]] = [
     ("match", matched, THOUSANDS, False),
     ("dominant_plane", of_ball(lambda p: features.dominant_plane(p, 0.01, min_share=0.01)), MILLIONS, False),
     ("from_mesh", mesh, (100_000, 200_000, 400_000, 864_000), False),
-    ("outer surface of slivers", slivers, (12_500, 25_000, 50_000, 100_000), False),
+    ("outer surface of slivers", slivers, (100_000, 200_000, 400_000, 800_000), False),
     ("find_symmetries", of_ball(ibi.find_symmetries), (20_000, 200_000, 1_000_000), False),
 ]

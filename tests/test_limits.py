@@ -126,6 +126,7 @@ TORUS = np.stack([np.cos(np.arange(48) / 7.6), np.sin(np.arange(48) / 7.6), np.a
 FACES = np.stack([np.arange(46), np.arange(1, 47), np.arange(2, 48)], -1)
 
 CALLS = {
+    "Model": ("Spacing", _model),
     "diameter": ("Diameter", lambda: metrics.diameter(ball(20_000))),
     "diameter of a model": ("Diameter", lambda: _model().diameter),
     "add_s": ("Metrics", lambda: metrics.add_s(ball(20_000), *poses(2))),

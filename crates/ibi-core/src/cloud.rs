@@ -8,7 +8,7 @@ use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::checks::{first_not_finite, unit_vectors};
 use crate::error::{Argument, Error};
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::columns::middle;
 use crate::kernels::nearby::spacing_until;
 use crate::kernels::neighbors::Neighbors;
@@ -124,7 +124,15 @@ impl<'a> PreparedCloud<'a> {
     /// # Errors
     /// Those of [`crate::Registrar::new`].
     pub fn source(cloud: &Cloud<'a>) -> Result<Self, Error> {
-        Self::new(cloud, Argument::Src, Argument::SrcNormals, Argument::SrcFrames, &Interrupt::never())
+        Self::source_until(cloud, &Interrupt::never())
+    }
+
+    /// The same, until it is interrupted.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] too.
+    pub fn source_until(cloud: &Cloud<'a>, interrupt: &Interrupt) -> Result<Self, Error> {
+        Self::new(cloud, Argument::Src, Argument::SrcNormals, Argument::SrcFrames, interrupt)
     }
 
     /// Checks `cloud` and builds what the stages need. `argument`, `normals` and `frames` are what errors call them.
@@ -157,6 +165,9 @@ impl<'a> PreparedCloud<'a> {
         let (centre, extent) = bounding_box(points);
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
+        }
+        if !interrupt.enter(Phase::Spacing) {
+            return Err(interrupt.error());
         }
         let spacing = spacing_until(points, || interrupt.is_set()).ok_or_else(|| interrupt.error())?;
         interrupt.proceed()?;

@@ -15,7 +15,7 @@ use pyo3::exceptions::PyTimeoutError;
 use pyo3::prelude::*;
 
 use crate::InputError;
-use crate::register::{self, rows3};
+use crate::register::{self, rows, rows3};
 
 /// Adds the functions of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -211,16 +211,14 @@ type Corners = (Vec<Point3<f64>>, Vec<[usize; 3]>);
 
 fn mesh(vertices: &Rows<'_>, faces: &PyReadonlyArray2<'_, i64>) -> PyResult<Corners> {
     let vertices = rows3(vertices, Point3::new)?;
-    let (faces, len) = (faces.as_array(), vertices.len());
-    if faces.ncols() != 3 {
-        return Err(InputError::new_err(format!("expected 3 columns, got {}", faces.ncols())));
-    }
-    let corner = |row: usize, column: usize| {
-        let index = faces[[row, column]];
+    let len = vertices.len();
+    let corner = |row: usize, column: usize, index: i64| {
         usize::try_from(index).map_err(|_| to_py(FeatureError::FaceIndex { row, column, index, len }))
     };
-    let face = |row| Ok([corner(row, 0)?, corner(row, 1)?, corner(row, 2)?]);
-    let faces: PyResult<Vec<[usize; 3]>> = (0..faces.nrows()).map(face).collect();
+    let face = |(row, &[a, b, c]): (usize, &[i64; 3])| {
+        Ok([corner(row, 0, a)?, corner(row, 1, b)?, corner(row, 2, c)?])
+    };
+    let faces: PyResult<Vec<[usize; 3]>> = rows(faces)?.iter().enumerate().map(face).collect();
     Ok((vertices, faces?))
 }
 

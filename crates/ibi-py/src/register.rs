@@ -50,7 +50,9 @@ impl Source {
         if let Some(symmetries) = symmetries {
             cloud = cloud.with_symmetries(symmetries.0.clone());
         }
-        let prepared = in_background(py, |_, _| PreparedCloud::source(&cloud).map_err(|e| to_py_err(&e)))?;
+        let prepared = in_background(py, |cancel, _| {
+            PreparedCloud::source_until(&cloud, &runs::watched(cancel)).map_err(|e| to_py_err(&e))
+        })?;
         Ok(Self(Arc::new(prepared)))
     }
 
@@ -275,7 +277,9 @@ pub(crate) fn rows3<T>(
 }
 
 /// The rows of a C-contiguous array.
-fn rows<'a, const N: usize, T: numpy::Element>(array: &'a PyReadonlyArray2<'_, T>) -> PyResult<&'a [[T; N]]> {
+pub(crate) fn rows<'a, const N: usize, T: numpy::Element>(
+    array: &'a PyReadonlyArray2<'_, T>,
+) -> PyResult<&'a [[T; N]]> {
     let array = array.as_array();
     if array.ncols() != N {
         return Err(InputError::new_err(format!("expected {N} columns, got {}", array.ncols())));

@@ -18,7 +18,7 @@ pub struct Thinned {
 }
 
 /// Points, or voxels, that one thread takes at a time.
-const GRAIN: usize = 1 << 12;
+const GRAIN: usize = 1 << 14;
 
 /// Bits of a key for each axis.
 const BITS: u32 = 21;
@@ -61,8 +61,8 @@ pub fn voxel_downsample(
         let cell = |axis: usize| ((p[axis] - origin[axis]) / voxel) as u64;
         (cell(0) << (2 * BITS)) | (cell(1) << BITS) | cell(2)
     };
-    let keys = par::chunks(points.len(), GRAIN, |run| points[run].iter().map(key).collect::<Vec<_>>());
-    let rows: Vec<(u64, u32)> = keys.into_iter().flatten().zip(0..).collect();
+    let of_row = |row: usize| (key(&points[row]), row as u32);
+    let rows = par::chunks(points.len(), GRAIN, |run| run.map(of_row).collect::<Vec<_>>()).concat();
     let rows = sorted(rows, interrupt).ok_or(FeatureError::Interrupted)?;
     let voxels: Vec<&[(u64, u32)]> = rows.chunk_by(|a, b| a.0 == b.0).collect();
     let mean = |voxel: &&[(u64, u32)]| mean(voxel, first, |row| points[row]);
@@ -74,7 +74,7 @@ pub fn voxel_downsample(
 }
 
 /// What `of` makes of each voxel.
-fn each<T: Send>(
+fn each<T: Copy + Send>(
     voxels: &[&[(u64, u32)]],
     interrupt: &Interrupt,
     of: impl Fn(&&[(u64, u32)]) -> T + Sync + Send,
@@ -82,11 +82,7 @@ fn each<T: Send>(
     let parts = par::chunks(voxels.len(), GRAIN, |run| {
         if interrupt.is_set() { Vec::new() } else { voxels[run].iter().map(&of).collect() }
     });
-    if interrupt.is_set() {
-        Err(FeatureError::Interrupted)
-    } else {
-        Ok(parts.into_iter().flatten().collect())
-    }
+    if interrupt.is_set() { Err(FeatureError::Interrupted) } else { Ok(parts.concat()) }
 }
 
 /// Relative to `near`, so that clouds far from the origin lose nothing.

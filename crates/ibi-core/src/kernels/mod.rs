@@ -8,6 +8,7 @@ pub mod cliques;
 pub mod columns;
 pub mod compatibility;
 pub mod dense_graph;
+pub(crate) mod discs;
 pub mod evidence;
 pub mod frames;
 pub mod graph;

@@ -4,8 +4,8 @@ use super::par;
 use crate::interrupt::Interrupt;
 use crate::pace::Pace;
 
-/// Items of a run: a few milliseconds.
-const RUN: usize = 1 << 16;
+/// Items of a run: ten to twenty milliseconds.
+const RUN: usize = 1 << 18;
 
 /// The items in ascending order; `None` if interrupted. Equal ones must be the same.
 pub(crate) fn sorted<T: Ord + Copy + Send + Sync>(

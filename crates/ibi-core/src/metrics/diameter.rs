@@ -1,12 +1,10 @@
 //! The diameter of a cloud.
 
-use std::ops::Range;
-
-use nalgebra::{Matrix3, Point3, Vector3};
+use nalgebra::{Point3, Vector3};
 
 use super::MetricsError;
-use crate::features::least_axis;
 use crate::interrupt::{Interrupt, Phase};
+use crate::kernels::discs::{Disc, LEAF};
 use crate::kernels::par;
 use crate::pace::Pace;
 
@@ -129,12 +127,6 @@ fn compare_all(
     Ok(longest)
 }
 
-/// Points of a leaf.
-const LEAF: usize = 16;
-
-/// Below this a thread builds a disc with all below it.
-const SERIAL: usize = 1 << 12;
-
 /// Pairs of discs that are handed to threads, about.
 const TASKS: usize = 256;
 
@@ -152,13 +144,14 @@ fn compare_discs(
         let (end, _) = farthest(&points, &points[k * points.len() / SWEEPS], interrupt)?;
         longest = longest.max(farthest(&points, &end, interrupt)?.1);
     }
-    let root = Disc::new(&mut points, 0, interrupt).ok_or(MetricsError::Interrupted)?;
+    let root =
+        Disc::new(&mut points, 0, &|p: &Point3<f64>| *p, interrupt).ok_or(MetricsError::Interrupted)?;
     // The tasks are the same on any number of threads, and none knows of what another one has found.
     let mut tasks = vec![(&root, &root)];
     loop {
         let halved: Vec<_> = tasks.iter().flat_map(|&(a, b)| a.halves(b)).collect();
         let is_done = halved.len() == tasks.len();
-        tasks = halved.into_iter().filter(|(a, b)| a.may_hold(b, longest)).collect();
+        tasks = halved.into_iter().filter(|(a, b)| may_hold(a.bound(b), longest)).collect();
         if is_done || tasks.len() >= TASKS || interrupt.is_set() {
             break;
         }
@@ -175,94 +168,9 @@ fn compare_discs(
     }
 }
 
-/// Points within a flat cylinder.
-struct Disc {
-    centre: Point3<f64>,
-    /// The axis, half the length and the radius of the cylinder.
-    axis: Vector3<f64>,
-    half: f64,
-    radius: f64,
-    /// No point is farther from the centre.
-    reach: f64,
-    run: Range<usize>,
-    /// Two, unless it is a leaf.
-    parts: Option<Box<[Disc; 2]>>,
-}
-
-impl Disc {
-    /// Of `points`, which begin at `start`; sorts them. `None` if interrupted.
-    fn new(points: &mut [Point3<f64>], start: usize, interrupt: &Interrupt) -> Option<Self> {
-        if points.len() >= SERIAL && interrupt.is_set() {
-            return None;
-        }
-        let mean = points.iter().fold(Vector3::zeros(), |sum, p| sum + (p - points[0])) / points.len() as f64;
-        let centre = points[0] + mean;
-        let spread: Matrix3<f64> = points.iter().map(|p| (p - centre) * (p - centre).transpose()).sum();
-        let axis = least_axis(&spread).unwrap_or_else(Vector3::z);
-        let (mut half, mut radius_sq, mut reach_sq) = (0.0_f64, 0.0_f64, 0.0_f64);
-        for p in points.iter() {
-            let offset = p - centre;
-            let along = offset.dot(&axis);
-            half = half.max(along.abs());
-            radius_sq = radius_sq.max((offset - axis * along).norm_squared());
-            reach_sq = reach_sq.max(offset.norm_squared());
-        }
-        let run = start..start + points.len();
-        let mut disc =
-            Self { centre, axis, half, radius: radius_sq.sqrt(), reach: reach_sq.sqrt(), run, parts: None };
-        if points.len() <= LEAF || reach_sq == 0.0 {
-            return Some(disc);
-        }
-        let widest = spread.diagonal().imax();
-        let middle = points.len() / 2;
-        points.select_nth_unstable_by(middle, |a, b| a[widest].total_cmp(&b[widest]));
-        let is_large = points.len() >= SERIAL;
-        let (low, high) = points.split_at_mut(middle);
-        let mut low = || Self::new(low, start, interrupt);
-        let mut high = || Self::new(high, start + middle, interrupt);
-        let (low, high) = if is_large { par::join(low, high) } else { (low(), high()) };
-        disc.parts = Some(Box::new([low?, high?]));
-        Some(disc)
-    }
-
-    /// How far a point of it may lie from its centre along a direction of length 1.
-    fn along(&self, direction: &Vector3<f64>) -> f64 {
-        let cos = self.axis.dot(direction).abs().min(1.0);
-        (self.half * cos + self.radius * (1.0 - cos * cos).sqrt()).min(self.reach)
-    }
-
-    /// No pair of points of two discs is farther apart, but for rounding.
-    fn bound(&self, other: &Self) -> f64 {
-        let between = other.centre - self.centre;
-        let apart = between.norm();
-        let around = self.reach + other.reach;
-        if apart <= around {
-            return apart + around;
-        }
-        let direction = between / apart;
-        (apart + self.along(&direction) + other.along(&direction)).hypot(around).min(apart + around)
-    }
-
-    /// Whether a pair of points of two discs may be longer, by more than [`NEGLIGIBLE`].
-    fn may_hold(&self, other: &Self, longest: f64) -> bool {
-        self.bound(other) > longest * (1.0 + NEGLIGIBLE)
-    }
-
-    /// Pairs of smaller discs that hold the same pairs of points; this one if there are none.
-    fn halves<'a>(&'a self, other: &'a Self) -> Vec<(&'a Self, &'a Self)> {
-        if std::ptr::eq(self, other) {
-            return match &self.parts {
-                Some(parts) => vec![(&parts[0], &parts[0]), (&parts[0], &parts[1]), (&parts[1], &parts[1])],
-                None => vec![(self, other)],
-            };
-        }
-        let halve_self = other.parts.is_none() || self.reach >= other.reach;
-        match (&self.parts, &other.parts) {
-            (Some(parts), _) if halve_self => parts.iter().map(|part| (part, other)).collect(),
-            (_, Some(parts)) => parts.iter().map(|part| (self, part)).collect(),
-            _ => vec![(self, other)],
-        }
-    }
+/// Whether a pair may be longer, by more than [`NEGLIGIBLE`], if it is no longer than the bound.
+fn may_hold(bound: f64, longest: f64) -> bool {
+    bound > longest * (1.0 + NEGLIGIBLE)
 }
 
 /// Raises `longest` to that of the pairs of points of two discs; false if interrupted.
@@ -284,9 +192,7 @@ fn descend(points: &[Point3<f64>], (a, b): (&Disc, &Disc), longest: &mut f64, pa
     }
     let mut pairs: Vec<_> = a.halves(b).into_iter().map(|(a, b)| (a.bound(b), (a, b))).collect();
     pairs.sort_by(|a, b| b.0.total_cmp(&a.0));
-    pairs
-        .into_iter()
-        .all(|(bound, pair)| bound <= *longest * (1.0 + NEGLIGIBLE) || descend(points, pair, longest, pace))
+    pairs.into_iter().all(|(bound, pair)| !may_hold(bound, *longest) || descend(points, pair, longest, pace))
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use super::{MetricsError, diameter};
 use crate::interrupt::{Interrupt, Phase};
+use crate::kernels::discs::Discs;
 use crate::kernels::neighbors::Neighbors;
 use crate::kernels::par;
 use crate::pace::Pace;
@@ -10,7 +11,7 @@ use nalgebra::{Isometry3, Point3};
 use std::borrow::Cow;
 use std::sync::OnceLock;
 
-/// The points of a model, with what its errors need: a kd-tree and the diameter, each made on first use.
+/// The points of a model, with what its errors need: a tree and the diameter, each made on first use.
 ///
 /// All errors are in the unit of the data. A dense model may be subsampled first: they are means and maxima
 /// over the surface, at a cost per point.
@@ -37,11 +38,22 @@ use std::sync::OnceLock;
 pub struct Model {
     points: Vec<Point3<f64>>,
     tree: OnceLock<Neighbors>,
+    discs: OnceLock<Discs>,
     diameter: OnceLock<f64>,
 }
 
 /// Points that one thread takes at a time.
 const GRAIN: usize = 1024;
+
+/// The work of a question for the nearest point, in the units of [`Pace`].
+const QUERY: usize = 256;
+
+/// A kd-tree is for no more points: building one cannot be interrupted.
+const MOST_OF_TREE: usize = 1 << 17;
+
+/// Points by which it is told whether a motion leaves the points near each other, and how many spacings near is.
+const SAMPLE: usize = 64;
+const NEAR: f64 = 4.0;
 
 impl Model {
     /// A model of these points, in its own frame.
@@ -57,7 +69,7 @@ impl Model {
         if let Some(index) = points.iter().position(|p| !p.iter().all(|x| x.abs() <= 1e150)) {
             return Err(MetricsError::NonFinitePoint { index });
         }
-        Ok(Self { points, tree: OnceLock::new(), diameter: OnceLock::new() })
+        Ok(Self { points, tree: OnceLock::new(), discs: OnceLock::new(), diameter: OnceLock::new() })
     }
 
     /// The points, as given.
@@ -105,7 +117,7 @@ impl Model {
     ///
     /// # Complexity
     ///
-    /// n queries of a kd-tree of n points.
+    /// n questions to a tree of n points.
     ///
     /// # Errors
     ///
@@ -119,30 +131,78 @@ impl Model {
         if !interrupt.enter(Phase::Metrics) {
             return Err(MetricsError::Interrupted);
         }
-        let tree = self.tree(interrupt)?;
         // Asked in the model's frame, where one tree serves every pose.
         let difference = predicted.inverse() * truth;
-        let parts = par::chunks(self.points.len(), GRAIN, |run| {
-            if interrupt.is_set() {
-                return Vec::new();
-            }
-            let gap = |p| tree.nearest(&(difference * p)).map_or(0.0, |(_, dist_sq)| dist_sq.sqrt());
-            self.points[run].iter().map(gap).collect()
-        });
+        let gaps_sq = if self.are_near(&difference) {
+            self.gaps_sq_by_tree(&difference, interrupt)
+        } else {
+            self.gaps_sq_by_discs(&difference, interrupt)?
+        };
         if interrupt.is_set() {
             return Err(MetricsError::Interrupted);
         }
-        Ok(parts.into_iter().flatten().sum::<f64>() / self.points.len() as f64)
+        Ok(gaps_sq.into_iter().map(f64::sqrt).sum::<f64>() / self.points.len() as f64)
+    }
+
+    /// Whether a kd-tree finds the nearest points of the moved ones faster: it does for those nearby, and is lost among points
+    /// that are all about as far off. The answers are the same.
+    fn are_near(&self, motion: &Isometry3<f64>) -> bool {
+        if self.points.len() > MOST_OF_TREE {
+            return false;
+        }
+        let tree = self.tree.get_or_init(|| Neighbors::new(&self.points));
+        let sample = || self.points.iter().step_by(self.points.len().div_ceil(SAMPLE));
+        let gap = |p| tree.nearest(&(motion * p)).map_or(0.0, |(_, dist_sq)| dist_sq.sqrt());
+        let first = self.points[0];
+        let size = sample().map(|p| (p - first).norm()).fold(0.0, f64::max);
+        let spacing = size / (self.points.len() as f64).sqrt();
+        sample().map(gap).sum::<f64>() <= NEAR * spacing * sample().count() as f64
+    }
+
+    /// How far each point is from the nearest one once it is moved, squared; less than all if interrupted.
+    fn gaps_sq_by_tree(&self, motion: &Isometry3<f64>, interrupt: &Interrupt) -> Vec<f64> {
+        let tree = self.tree.get_or_init(|| Neighbors::new(&self.points));
+        let parts = par::chunks(self.points.len(), GRAIN, |run| {
+            let mut pace = Pace::new(interrupt);
+            let points = self.points[run].iter().take_while(|_| !pace.is_over(QUERY));
+            points
+                .map(|p| tree.nearest(&(motion * p)).map_or(0.0, |(_, dist_sq)| dist_sq))
+                .collect::<Vec<_>>()
+        });
+        parts.concat()
+    }
+
+    /// The same by discs.
+    fn gaps_sq_by_discs(
+        &self,
+        motion: &Isometry3<f64>,
+        interrupt: &Interrupt,
+    ) -> Result<Vec<f64>, MetricsError> {
+        let discs = self.discs(interrupt)?;
+        let parts = par::chunks(self.points.len(), GRAIN, |run| {
+            let (mut near, mut pace) = (run.start, Pace::new(interrupt));
+            let gap_sq = |(point, row): &(Point3<f64>, u32)| {
+                let found = discs.nearest(&(motion * point), near);
+                near = found.1;
+                (*row, found.0)
+            };
+            let points = discs.points()[run].iter().take_while(|_| !pace.is_over(QUERY));
+            points.map(gap_sq).collect::<Vec<_>>()
+        });
+        // By row, so that sums do not depend on the tree.
+        let mut gaps_sq = vec![0.0; self.points.len()];
+        parts.into_iter().flatten().for_each(|(row, gap_sq)| gaps_sq[row as usize] = gap_sq);
+        Ok(gaps_sq)
     }
 
     /// Built on first use.
-    fn tree(&self, interrupt: &Interrupt) -> Result<&Neighbors, MetricsError> {
-        if let Some(tree) = self.tree.get() {
-            return Ok(tree);
+    fn discs(&self, interrupt: &Interrupt) -> Result<&Discs, MetricsError> {
+        if let Some(discs) = self.discs.get() {
+            return Ok(discs);
         }
-        // As above.
-        let tree = Neighbors::until(&self.points, interrupt).ok_or(MetricsError::Interrupted)?;
-        Ok(self.tree.get_or_init(|| tree))
+        // Not from within `get_or_init`, as above.
+        let discs = Discs::new(&self.points, interrupt).ok_or(MetricsError::Interrupted)?;
+        Ok(self.discs.get_or_init(|| discs))
     }
 
     /// MSSD: the largest distance between a model point under the prediction and the same point under the
@@ -251,6 +311,14 @@ mod tests {
             prop_assert!((model.add(&a, &b) - add / model.points().len() as f64).abs() < 1e-9);
             prop_assert!((model.add_s(&a, &b, &Interrupt::never()).unwrap() - naive_add_s(&model, &a, &b)).abs() < 1e-9);
             prop_assert!((model.mssd(&a, &b, &Symmetries::new(&symmetries, &[]).unwrap(), &Interrupt::never()).unwrap() - naive_mssd(&model, &a, &b, &symmetries)).abs() < 1e-9);
+        }
+
+        #[test]
+        fn add_s_is_the_same_by_either_tree(model in models(), a in isometries(), far in any::<bool>()) {
+            let small = Isometry3::from_parts((0.01 * a.translation.vector).into(), Isometry3::identity().rotation);
+            let (motion, never) = (if far { a } else { small }, Interrupt::never());
+            let by_discs = model.gaps_sq_by_discs(&motion, &never).unwrap();
+            prop_assert_eq!(model.gaps_sq_by_tree(&motion, &never), by_discs);
         }
 
         #[test]

@@ -126,7 +126,7 @@ impl SceneScore {
 ///
 /// # Complexity
 ///
-/// One distance per pair (for ADD-S, n queries of a kd-tree each), then one to one an assignment,
+/// One distance per pair (for ADD-S, n questions to a tree each), then one to one an assignment,
 /// O(min^2 max) in the two numbers of poses.
 ///
 /// # Errors

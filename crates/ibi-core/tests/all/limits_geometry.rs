@@ -12,7 +12,10 @@ use ibi_core::metrics::{
     self, Criterion, MetricsError, Model, PoseThresholds, assignment, diameter, mssd_recall, score_scene,
 };
 use ibi_core::nalgebra::{Isometry3, Matrix3, Point3, Vector3};
-use ibi_core::{CancelToken, FindSymmetries, Interrupt, Phase, Symmetries, SymmetryError, find_symmetries};
+use ibi_core::{
+    CancelToken, Cloud, Error, FindSymmetries, Interrupt, Phase, PreparedCloud, Symmetries, SymmetryError,
+    find_symmetries,
+};
 use ibi_testkit::Rng;
 use ibi_testkit::features as naive;
 use ibi_testkit::shapes::{self, Solid};
@@ -187,7 +190,7 @@ fn jobs(phase: Phase) -> Vec<(&'static str, Job)> {
                 let (model, [a, b]) = (Model::new(ball(9000)).unwrap(), [0, 1].map(|k| poses(2)[k]));
                 Box::new(move |interrupt| metric(model.add_s(&a, &b, interrupt)))
             }),
-            ("add_s with trees to be built", {
+            ("add_s by discs to be built", {
                 let cloud = ball(140_000);
                 let near = Isometry3::translation(1e-4, 0.0, 0.0);
                 Box::new(move |interrupt| {
@@ -227,8 +230,15 @@ fn jobs(phase: Phase) -> Vec<(&'static str, Job)> {
                 })
             }),
         ],
+        Phase::Spacing => vec![("of many points", {
+            let cloud = ball(30_000);
+            Box::new(move |interrupt| match PreparedCloud::source_until(&Cloud::new(&cloud), interrupt) {
+                Err(Error::Interrupted { .. }) => true,
+                Err(error) => panic!("{error}"),
+                Ok(_) => false,
+            })
+        })],
         Phase::Prepare
-        | Phase::Spacing
         | Phase::Graph
         | Phase::Select
         | Phase::Enhance
