@@ -7,7 +7,7 @@ import os
 import ibi_rs as ibi
 import numpy as np
 import pytest
-from ibi_rs import _files, _text, cli
+from ibi_rs import _files, _numbers, cli
 from test_viz import NO_RERUN
 
 SCENE = ibi.synth.outlier_layout(0, num_instances=2, num_correspondences=300, num_points=128)
@@ -183,7 +183,7 @@ def test_what_is_no_json_is_named(text, tmp_path):
     ],
 )
 def test_lengths_have_the_decimals_that_mean_something(value, scale, text):
-    assert _text.lengths([value], scale) == [text]
+    assert _numbers.lengths([value], scale) == [text]
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_lengths_have_the_decimals_that_mean_something(value, scale, text):
     [(0.00256234, "0.002562"), (123456.7, "123457"), (0.0, "0"), (12345, "12345"), (1e300, "1e+300")],
 )
 def test_numbers_have_as_many_digits_as_count(value, text):
-    assert _text.significant(value) == text
+    assert _numbers.significant(value) == text
 
 
 def test_far_from_the_origin_no_digit_is_lost():

@@ -7,8 +7,8 @@ from typing import get_args
 import ibi_rs as ibi
 import numpy as np
 import pytest
+from ibi_rs._core import features_nearest_rows
 from ibi_rs._inputs import _scan
-from ibi_rs._nearest import BLOCK, nearest_rows
 from ibi_rs.variants import Ce, Scs, Te
 
 SCENE = ibi.synth.outlier_layout(
@@ -544,13 +544,13 @@ def test_what_is_no_scan_is_refused(points, normals, pattern):
         _scan("tgt", points, normals)
 
 
-@pytest.mark.parametrize("num_points", [1, 2, 100, 3 * BLOCK])
+@pytest.mark.parametrize("num_points", [1, 2, 100, 6000])
 @pytest.mark.parametrize("stretch", [(1, 1, 1), (0, 5, 0), (0, 0, 0), (1e-3, 1, 9)])
 def test_the_nearest_points_are_the_nearest(num_points, stretch):
     rng = np.random.default_rng(num_points)
     points = rng.normal(size=(num_points, 3)) * stretch + 1000
-    queries = rng.normal(size=(2 * BLOCK + 7, 3)) * (2 * np.array(stretch) + 0.1) + 1000
-    found = np.linalg.norm(points[nearest_rows(points, queries)] - queries, axis=1)
+    queries = rng.normal(size=(4007, 3)) * (2 * np.array(stretch) + 0.1) + 1000
+    found = np.linalg.norm(points[features_nearest_rows(points, queries)] - queries, axis=1)
     for block in np.array_split(np.arange(len(queries)), 30):
         least = np.linalg.norm(points[None] - queries[block, None], axis=2).min(axis=1)
         np.testing.assert_allclose(found[block], least, rtol=1e-5)

@@ -152,7 +152,6 @@ CALLS = {
 }
 
 
-@pytest.mark.skipif(not hasattr(_core, "_watch"), reason="this build has no way to watch phases")
 @pytest.mark.parametrize("num_threads", ["1", "2"])
 @pytest.mark.parametrize("name", CALLS)
 def test_ctrl_c_is_heard_within_the_call(monkeypatch, name, num_threads):

@@ -17,6 +17,7 @@ __all__ = [
     "features_estimate_normals",
     "features_fpfh",
     "features_match",
+    "features_nearest_rows",
     "features_outer_surface",
     "features_sample_mesh",
     "features_voxel_downsample",
@@ -117,6 +118,7 @@ def symmetries_find(points: _Floats, normals: _Floats | None, tolerance: float) 
 
 # With `timeout_s`, counted from the call, a TimeoutError says that time has run out.
 
+def features_nearest_rows(points: _Floats, queries: _Floats) -> _Ints: ...
 def features_voxel_downsample(
     points: _Floats,
     normals: _Floats | None,

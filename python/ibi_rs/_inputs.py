@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs._core import InputError
-from ibi_rs._nearest import nearest_rows
+from ibi_rs._core import InputError, features_nearest_rows
 
 Points = Any
 """(N, 3) real numbers, or an object with ``.points``, ``.vertices``, ``__array__`` or ``__dlpack__``."""
@@ -129,7 +128,7 @@ def _completed(
     if num_missing > _MOST_WITHOUT_NORMAL * len(normals):
         return None, num_missing
     normals = normals.copy()
-    normals[is_missing] = normals[~is_missing][nearest_rows(points[~is_missing], points[is_missing])]
+    normals[is_missing] = normals[~is_missing][features_nearest_rows(points[~is_missing], points[is_missing])]
     return normals, num_missing
 
 

@@ -27,7 +27,7 @@ from ibi_rs._inputs import (
     _vector,
 )
 from ibi_rs._match import match
-from ibi_rs._text import significant
+from ibi_rs._numbers import significant
 from ibi_rs._view import View, _camera
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings

@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs._text import lengths, significant
+from ibi_rs._numbers import lengths, significant
 from ibi_rs.params import Params
 from ibi_rs.symmetries import Symmetries
 

@@ -9,6 +9,7 @@ use ibi_core::Interrupt;
 use ibi_core::features::{
     self, Amount, Descriptors, FeatureError, Matching, Mesh, Neighborhood, PlaneSearch, Views,
 };
+use ibi_core::kernels::neighbors::Neighbors;
 use ibi_core::nalgebra::{Point3, Vector3};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::exceptions::PyTimeoutError;
@@ -26,6 +27,7 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(features_dominant_plane, m)?)?;
     m.add_function(wrap_pyfunction!(features_sample_mesh, m)?)?;
     m.add_function(wrap_pyfunction!(features_outer_surface, m)?)?;
+    m.add_function(wrap_pyfunction!(features_nearest_rows, m)?)?;
     Ok(())
 }
 
@@ -105,6 +107,21 @@ fn keypoint_rows(rows: &PyReadonlyArray1<'_, i64>, len: usize) -> PyResult<Vec<u
         })
     };
     rows.as_array().iter().enumerate().map(row).collect()
+}
+
+/// For each query the row of the nearest of the points, of which there is one at least; all finite.
+#[pyfunction]
+fn features_nearest_rows<'py>(
+    py: Python<'py>,
+    points: Rows<'py>,
+    queries: Rows<'py>,
+) -> PyResult<Bound<'py, PyArray1<i64>>> {
+    let (points, queries) = (rows3(&points, Point3::new)?, rows3(&queries, Point3::new)?);
+    let rows: Vec<i64> = py.detach(|| {
+        let tree = Neighbors::new(&points);
+        queries.iter().filter_map(|query| tree.nearest(query)).map(|(row, _)| i64::from(row)).collect()
+    });
+    Ok(rows.into_pyarray(py))
 }
 
 /// (M, 2) int64 [source row, target row], and (M,) float64.

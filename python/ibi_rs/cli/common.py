@@ -22,7 +22,7 @@ import ibi_rs as ibi
 from ibi_rs import _interrupts, io, metrics
 from ibi_rs._files import try_writing, written
 from ibi_rs._inputs import _MAX_THREADS, _num_threads
-from ibi_rs._text import lengths
+from ibi_rs._numbers import lengths
 from ibi_rs.symmetries import _bop_entry as bop_entry
 
 try:

@@ -18,14 +18,14 @@ from ibi_rs._core import InputError
 from ibi_rs._inputs import _completed, _number
 from ibi_rs._view import _intrinsics, depth_points
 
-from . import _arrays, _clouds, _meshes, _ply, _text
-from ._files import Floats, PathLike, Rows, extra, reading
+from . import _arrays, _clouds, _columns, _meshes, _ply
+from ._reading import Floats, PathLike, Rows, extra, reading
 
 __all__ = ["Scan", "read_cloud", "read_depth", "read_mesh", "read_scan", "read_viewpoint"]
 
 _READERS: dict[str, Callable[[Path], Rows]] = {
     **dict.fromkeys(_meshes.SUFFIXES, _meshes.vertices),
-    **dict.fromkeys((".xyz", ".txt", ".csv", ".pts"), _text.read),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".pts"), _columns.read),
     **dict.fromkeys((".las", ".laz"), _clouds.las),
     ".pcd": _clouds.pcd,
     ".npy": _arrays.npy,

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ibi_rs._core import InputError
 
-from ._files import Floats, Rows, check_count, check_most, place, unnamed
+from ._reading import Floats, Rows, check_count, check_most, place, unnamed
 
 MAX_HEADER = 10_000
 """Bytes; numpy's own limit, which it looks at when it has read them."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ibi_rs._core import InputError
 
-from ._files import Floats, Rows, check_count, check_most, check_rows, extra, place
+from ._reading import Floats, Rows, check_count, check_most, check_rows, extra, place
 
 AXES, NORMALS = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from . import _ply, _whole
-from ._files import Floats, check_count, extra
 from ._polygons import Faces, checked, fans
+from ._reading import Floats, check_count, extra
 
 
 def opened(path: Path, ply: _ply.Ply | None, **options: Any) -> Any:

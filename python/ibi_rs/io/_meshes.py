@@ -12,9 +12,9 @@ from ibi_rs import features
 from ibi_rs._core import InputError
 
 from . import _ply
-from ._files import Floats, Rows, extra
 from ._loaded import mixed, names, opened
 from ._polygons import Faces, along_outlines, checked
+from ._reading import Floats, Rows, extra
 from ._whole import check_file, obj_lines, off_counts, off_lines
 
 NORMALS = ("nx", "ny", "nz")

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ibi_rs._core import InputError
 
-from ._files import Floats, check_count, check_most, check_rows, place
+from ._reading import Floats, check_count, check_most, check_rows, place
 
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),

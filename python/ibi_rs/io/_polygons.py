@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ibi_rs._core import InputError
 
-from ._files import Floats, extra
+from ._reading import Floats, extra
 
 Faces = npt.NDArray[np.int64]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from ibi_rs._core import InputError
 
 from . import _ply
-from ._files import check_count, check_most
+from ._reading import check_count, check_most
 
 
 def check_file(path: Path) -> _ply.Ply | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ibi_rs._core import InputError
 
-from ._files import Floats, Rows, check_count, check_most, unnamed
+from ._reading import Floats, Rows, check_count, check_most, unnamed
 
 COMMENTS = ("#", "//", "%")
 AXES = ("x", "y", "z")
