@@ -33,12 +33,12 @@ demo: $(STAMPS)/package $(STAMPS)/group-demo ## register the example scenes and 
 
 .PHONY: test
 test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and Python
-	cargo test --workspace --exclude ibi-py --all-features
+	cargo test --workspace --exclude ibi-py --exclude ibi-bench --all-features
 	$(BIN)/python -m pytest
 
 .PHONY: test-all
 test-all: cargo $(STAMPS)/package $(STAMPS)/open3d $(STAMPS)/group-all ## the same with all that is optional, none skipped (installs Open3D, Dask, Ray, Rerun)
-	cargo test --workspace --exclude ibi-py --all-features
+	cargo test --workspace --exclude ibi-py --exclude ibi-bench --all-features
 	$(BIN)/python -m pytest --none-skipped
 
 .PHONY: test-clusters
@@ -63,7 +63,7 @@ fuzz: cargo $(STAMPS)/package $(STAMPS)/group-test ## throw odd inputs at all th
 
 .PHONY: bench
 bench: cargo ## time stages, kernels and whole runs with criterion; ARGS=gsac picks some
-	cargo bench -p ibi-core --bench '*' -- $(ARGS)
+	cargo bench -p ibi-bench --bench '*' -- $(ARGS)
 
 # Two threads of BLAS that wait for each other on a busy machine took seven times as long as one.
 PAPER_TABLES := OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/paper_tables.py

@@ -1,6 +1,6 @@
 //! What can be wrong with the input. Finding nothing is not an error, see [`crate::StopReason`].
 
-use crate::registration::StopReason;
+use crate::stop::StopReason;
 
 /// Why a call was refused. Every message is one line that names the argument, the place and what is allowed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

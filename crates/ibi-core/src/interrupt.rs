@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use crate::error::Error;
-use crate::registration::StopReason;
+use crate::stop::StopReason;
 
 /// Cancels the runs it was handed to, from any thread.
 #[derive(Debug, Clone, Default)]

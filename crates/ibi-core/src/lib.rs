@@ -23,35 +23,45 @@
 //! parameters and results plain data.
 
 mod checks;
-mod claims;
-mod cloud;
-mod correspondence;
+mod detail;
 mod error;
+mod evidence;
 pub mod features;
-mod finish;
+mod grace;
 mod interrupt;
-mod joint;
+#[cfg(feature = "internals")]
 pub mod kernels;
-mod ledger;
+#[cfg(not(feature = "internals"))]
+#[allow(dead_code, unused_imports, unreachable_pub, reason = "public with the feature `internals`")]
+mod kernels;
 pub mod metrics;
 mod pace;
 mod params;
+mod ranges;
 mod registrar;
 mod registration;
+#[cfg_attr(
+    not(feature = "internals"),
+    allow(unreachable_pub, reason = "public with the feature `internals`")
+)]
+mod rounds;
 mod scene;
 pub mod stages;
-mod state;
+mod stop;
 mod symmetries;
 
-pub use claims::{Claims, NearClaims};
-pub use cloud::{Cloud, PreparedCloud};
-pub use correspondence::{Alive, Correspondences, PointPairs};
+pub use detail::Detail;
 pub use error::{Argument, Error};
+pub use evidence::Support;
 pub use interrupt::{CancelToken, Interrupt, Phase, Watcher};
 pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};
-pub use registration::{Pose, Registration, Round, StopReason, Timings};
-pub use scene::{Detail, Scene};
-pub use state::State;
+pub use registration::{Pose, Registration, Round, Timings};
+#[cfg(feature = "internals")]
+pub use rounds::Shortcuts;
+pub use rounds::State;
+pub use scene::{Alive, Cloud, Correspondences, PointPairs, PreparedCloud, Scene, Tolerances};
+pub use stages::{Claims, NearClaims};
+pub use stop::StopReason;
 pub use symmetries::{Axis, BOP_STEP, FindSymmetries, Symmetries, SymmetryError, Turning, find_symmetries};

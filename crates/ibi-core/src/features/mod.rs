@@ -34,7 +34,6 @@ pub use fpfh::{FPFH_DIM, fpfh};
 pub use matching::{Descriptors, Matches, Matching, match_features};
 pub use mesh::{Amount, Mesh, Sampled, sample_mesh};
 pub use normals::estimate_normals;
-pub(crate) use normals::least_axis;
 pub use outer::{Views, outer_surface};
 pub use plane::{Plane, PlaneSearch, dominant_plane};
 pub use voxel::{Thinned, voxel_downsample};

@@ -6,6 +6,7 @@ use super::FeatureError;
 use super::around::{Around, Neighborhood, Others};
 use super::door::{check_place, check_points};
 use crate::interrupt::{Interrupt, Phase};
+use crate::kernels::spread::least_axis;
 
 /// The normal of each point: across the plane through its neighbours, by PCA (Hoppe et al. 1992).
 ///
@@ -72,34 +73,4 @@ fn normal(around: &Around, place: usize, others: &Others, to_eye: Option<Vector3
         // An eye at the point sees nothing of it.
         (None, eye) => eye.and_then(|eye| eye.try_normalize(0.0)).unwrap_or_else(Vector3::z),
     }
-}
-
-/// The direction of least spread of a symmetric matrix; `None` where there is no spread at all.
-///
-/// The roots of the characteristic polynomial in closed form (Smith 1961). Where the two least are nearly one, as for
-/// points on a line, it loses digits, and the iteration takes over: ten times as slow.
-pub(crate) fn least_axis(spread: &Matrix3<f64>) -> Option<Vector3<f64>> {
-    let size = spread.amax();
-    if size <= 0.0 {
-        return None;
-    }
-    let a = spread / size;
-    let mean = a.trace() / 3.0;
-    let off = a - Matrix3::from_diagonal_element(mean);
-    let width = (off.norm_squared() / 6.0).sqrt();
-    if width > 0.0 {
-        let turn = (0.5 * (off / width).determinant()).clamp(-1.0, 1.0).acos() / 3.0;
-        let least = mean + 2.0 * width * (turn + std::f64::consts::TAU / 3.0).cos();
-        let rest = a - Matrix3::from_diagonal_element(least);
-        let [x, y, z] = [0, 1, 2].map(|c| rest.column(c).into_owned());
-        // Each is across two columns, and so across all; its length is the area that they span.
-        let across = [x.cross(&y), y.cross(&z), z.cross(&x)];
-        let areas = across.map(|v| v.norm());
-        let best = (0..3).fold(0, |best, k| if areas[k] > areas[best] { k } else { best });
-        if areas[best] > 1e-3 * width * width {
-            return Some(across[best] / areas[best]);
-        }
-    }
-    let eigen = a.symmetric_eigen();
-    eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned().try_normalize(0.0)
 }

@@ -4,12 +4,12 @@ use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::FeatureError;
 use super::door::{check_length, check_place, check_points};
-use super::normals::least_axis;
 use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::columns::{columns, middle};
 use crate::kernels::par;
 use crate::kernels::rng::Rng;
 use crate::kernels::simd::simd;
+use crate::kernels::spread::least_axis;
 
 /// What counts as a plane.
 #[derive(Debug, Clone, Copy, PartialEq)]

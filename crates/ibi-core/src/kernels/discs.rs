@@ -8,7 +8,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::par;
-use crate::features::least_axis;
+use super::spread::least_axis;
 use crate::interrupt::Interrupt;
 
 /// By so many reaches a disc is made larger, for rounding.

@@ -4,7 +4,7 @@
 //! process that forks after using it (Python's `multiprocessing` on Linux) hangs on the next use, where a pool of ours
 //! sees that it has come into another process. Results are collected in order, so the number of threads never changes them.
 
-use crate::Error;
+use crate::error::Error;
 
 /// A thread pool of our own, or, for one thread, none at all.
 ///

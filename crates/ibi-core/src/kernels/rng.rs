@@ -4,6 +4,16 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Quaternion, UnitQuaternion};
 
+/// The stages, as keys of random streams.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Stage {
+    Scs,
+    Ce,
+    Te,
+    Hv,
+}
+
 /// `SplitMix64` (Steele, Lea & Flood 2014): one word of state, and good enough to draw samples.
 #[derive(Debug, Clone)]
 pub struct Rng(u64);

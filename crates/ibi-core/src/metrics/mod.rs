@@ -42,7 +42,6 @@
 
 mod assignment;
 mod criterion;
-mod diameter;
 #[cfg(test)]
 mod laws;
 mod mean_score;
@@ -51,16 +50,41 @@ mod mssd_recall;
 mod pose_error;
 mod scene_score;
 #[cfg(test)]
-mod strategies;
+pub(crate) mod strategies;
+
+use nalgebra::Point3;
+
+use crate::interrupt::Interrupt;
 
 pub use assignment::assignment;
 pub use criterion::{ADD_S_DIAMETER_FRACTION, Criterion, Matching, PoseThresholds};
-pub use diameter::diameter;
 pub use mean_score::{MeanScore, mean_score};
 pub use model::Model;
 pub use mssd_recall::{MSSD_DIAMETER_FRACTIONS, MssdRecall, mssd_recall};
 pub use pose_error::{frobenius_distance, rotation_error_rad, translation_error};
 pub use scene_score::{PoseMatch, SceneScore, score_scene, score_scene_modulo};
+
+/// The largest distance between two points of a cloud; 0 for fewer than two points. Exact but for 1e-14 of it where very many
+/// points are about equally far from the middle.
+///
+/// The unit in which ADD-S and MSSD thresholds are given.
+///
+/// # Errors
+/// [`MetricsError::Interrupted`].
+///
+/// # Examples
+/// ```
+/// use ibi_core::Interrupt;
+/// use ibi_core::metrics::diameter;
+/// use nalgebra::Point3;
+///
+/// let box_corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 2.0, 2.0]].map(Point3::from);
+/// assert_eq!(diameter(&box_corners, &Interrupt::never())?, 3.0);
+/// # Ok::<(), ibi_core::metrics::MetricsError>(())
+/// ```
+pub fn diameter(points: &[Point3<f64>], interrupt: &Interrupt) -> Result<f64, MetricsError> {
+    crate::kernels::diameter::diameter(points, interrupt).ok_or(MetricsError::Interrupted)
+}
 
 /// Why a metric has no value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

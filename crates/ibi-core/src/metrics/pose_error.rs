@@ -2,6 +2,8 @@
 
 use nalgebra::{Isometry3, Matrix4};
 
+use crate::kernels::rotation::angle_between;
+
 /// The angle of the rotation that leads from one pose to the other, in \[0, pi\] rad.
 ///
 /// From the relative unit quaternion (w, v): 2 atan2(|v|, |w|). The usual arc cosine of the trace is NaN once
@@ -20,9 +22,7 @@ use nalgebra::{Isometry3, Matrix4};
 /// ```
 #[must_use]
 pub fn rotation_error_rad(a: &Isometry3<f64>, b: &Isometry3<f64>) -> f64 {
-    let relative = a.rotation.inverse() * b.rotation;
-    // |w|: a quaternion and its negative are the same rotation.
-    2.0 * relative.imag().norm().atan2(relative.w.abs())
+    angle_between(&a.rotation, &b.rotation)
 }
 
 /// The distance of the two translations, in the unit of the data.

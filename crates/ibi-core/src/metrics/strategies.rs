@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use std::ops::Range;
 
 /// Rigid motions: any rotation, translations within 10 of the origin.
-pub(super) fn isometries() -> impl Strategy<Value = Isometry3<f64>> {
+pub(crate) fn isometries() -> impl Strategy<Value = Isometry3<f64>> {
     let quaternion = prop::array::uniform4(-1.0..1.0)
         .prop_map(|[w, i, j, k]| nalgebra::Quaternion::new(w, i, j, k))
         .prop_filter("too short to normalise", |q| q.norm() > 1e-3);
@@ -14,7 +14,7 @@ pub(super) fn isometries() -> impl Strategy<Value = Isometry3<f64>> {
 }
 
 /// Clouds within 10 of the origin, repeated and collinear points included.
-pub(super) fn points(count: Range<usize>) -> impl Strategy<Value = Vec<Point3<f64>>> {
+pub(crate) fn points(count: Range<usize>) -> impl Strategy<Value = Vec<Point3<f64>>> {
     let coordinate = || prop_oneof![-10.0..10.0, (-2..=2_i32).prop_map(f64::from)];
     let point = (coordinate(), coordinate(), coordinate()).prop_map(|(x, y, z)| Point3::new(x, y, z));
     prop::collection::vec(point, count)

@@ -15,7 +15,7 @@ use std::f64::consts::{PI, TAU};
 
 use crate::checks::MAX_COORDINATE;
 use crate::features::FeatureError;
-use crate::metrics::rotation_error_rad;
+use crate::kernels::rotation::angle_between;
 
 /// The step in which BOP lists the turns about an axis: no point of the model moves farther than this part of its
 /// diameter from one to the next (Hodan et al., "BOP challenge 2020 on 6D object localization").
@@ -244,7 +244,7 @@ impl Symmetries {
                     Isometry3::from_parts(Translation3::from(shift), turned)
                 }
             };
-            let error = rotation_error_rad(&other, reference);
+            let error = angle_between(&other.rotation, &reference.rotation);
             if error < least - EQUAL {
                 (best, least) = (other, error);
             }

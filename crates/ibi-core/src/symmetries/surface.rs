@@ -5,11 +5,11 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use super::SymmetryError;
 use crate::features::{Neighborhood, estimate_normals, voxel_downsample};
 use crate::interrupt::Interrupt;
+use crate::kernels::diameter::diameter;
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::Nearby;
 use crate::kernels::overlap::{Contact, Surface};
 use crate::kernels::rng::Rng;
-use crate::metrics::diameter;
 
 /// Fewer points show no shape.
 const LEAST_POINTS: usize = 10;
@@ -73,7 +73,7 @@ impl Shape {
         let centre = Point3::from(thinned.points.iter().map(|p| p - low).sum::<Vector3<f64>>() / len as f64);
         let centre = low + centre.coords;
         let size = diameter(&sampled(&thinned.points, DIAMETER_POINTS), interrupt);
-        let size = size.map_err(|_| SymmetryError::Interrupted)?;
+        let size = size.ok_or(SymmetryError::Interrupted)?;
         let points: Vec<Point3<f64>> =
             thinned.points.iter().map(|p| Point3::from((p - centre) / size)).collect();
         let gap = gap(&points);

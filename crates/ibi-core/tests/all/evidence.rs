@@ -1,7 +1,7 @@
 //! What speaks for a pose: the support of its correspondences against chance, and how closely the clouds fit.
 
 use crate::oriented::{Oriented, clouds};
-use ibi_core::kernels::evidence::Support;
+use ibi_core::Support;
 use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, chance_fit, fit, overlap, places};
 use ibi_core::kernels::par::Pool;

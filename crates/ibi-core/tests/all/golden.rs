@@ -9,12 +9,12 @@
 //! IBI_BLESS=1 cargo test -p ibi-core --all-features --test all golden
 //! ```
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use ibi_core::nalgebra::{Isometry3, Matrix4, Point3};
-use ibi_core::{Cloud, Correspondences, Params, Registrar, Registration};
+use ibi_core::{Cloud, Correspondences, Params, Registrar, Registration, Shortcuts};
 use ibi_testkit::scenes::{Recipe, Scene};
 use serde_json::{Value, json};
 
@@ -128,11 +128,16 @@ fn read<T: serde::de::DeserializeOwned>(file: &Value, key: &str) -> T {
 }
 
 fn register(file: &Value) -> Registration {
+    register_by(file, Shortcuts::default(), 2)
+}
+
+fn register_by(file: &Value, shortcuts: Shortcuts, num_threads: usize) -> Registration {
     let cloud = |key| Cloud::from(read::<Vec<[f64; 3]>>(file, key));
     Registrar::new(&cloud("src"))
         .unwrap()
         .params(read::<Params>(file, "params"))
-        .num_threads(2)
+        .shortcuts(shortcuts)
+        .num_threads(num_threads)
         .register(&cloud("tgt"), &Correspondences::from_rows(read(file, "corr")))
         .unwrap()
 }
@@ -196,6 +201,17 @@ fn check_file(file: &Value) {
     assert!(found.iter().all(|f| truth.iter().any(|t| near(t, f))), "{name}: a pose is wrong");
 }
 
+/// The golden files, by their names.
+fn files() -> BTreeMap<String, Value> {
+    let paths = std::fs::read_dir(folder()).unwrap().map(|entry| entry.unwrap().path());
+    let paths = paths.filter(|path| path.extension().is_some_and(|extension| extension == "json"));
+    let read = |path: PathBuf| {
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        (name, serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap())
+    };
+    paths.map(read).collect()
+}
+
 #[test]
 fn results_are_those_of_the_files() {
     if std::env::var_os("IBI_BLESS").is_some_and(|value| value == "1") {
@@ -204,16 +220,46 @@ fn results_are_those_of_the_files() {
             write_file(&scene, &params);
         }
     }
-    let mut names = BTreeSet::new();
-    for entry in std::fs::read_dir(folder()).unwrap() {
-        let path = entry.unwrap().path();
-        if path.extension().is_some_and(|extension| extension == "json") {
-            let file: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
-            check_file(&file);
-            assert_eq!(path.file_stem().unwrap().to_str(), file["name"].as_str());
-            names.insert(file["name"].as_str().unwrap().to_owned());
+    let files = files();
+    for (name, file) in &files {
+        check_file(file);
+        assert_eq!(file["name"], *name);
+    }
+    let expected: BTreeSet<&str> = cases().iter().map(|(scene, _)| scene.name).collect();
+    assert_eq!(files.keys().map(String::as_str).collect::<BTreeSet<_>>(), expected);
+}
+
+#[test]
+fn without_shortcuts_the_same_poses_are_found() {
+    let all = Shortcuts::default();
+    let fewer = [
+        Shortcuts { glance: false, ..all },
+        Shortcuts { memory: false, ..all },
+        Shortcuts { ahead: false, ..all },
+        Shortcuts::NONE,
+    ];
+    for (name, file) in files() {
+        let usual = register(&file);
+        let bits = |result: &Registration| {
+            let poses: Vec<_> =
+                result.poses.iter().map(|pose| (pose.target_from_source, pose.score)).collect();
+            (poses, result.labels.clone(), result.rounds.clone())
+        };
+        // Looking ahead guesses, and a wrong guess costs time only; on one thread there is none.
+        for num_threads in [1, 2, 7] {
+            for ahead in [false, true] {
+                let result = register_by(&file, Shortcuts { ahead, ..all }, num_threads);
+                assert!(bits(&result) == bits(&usual), "{name}: {num_threads} threads, ahead {ahead}");
+            }
+        }
+        for shortcuts in fewer {
+            let plain = register_by(&file, shortcuts, 2);
+            assert_eq!(plain.poses.len(), usual.poses.len(), "{name}: {shortcuts:?}");
+            for (a, b) in plain.poses.iter().zip(&usual.poses) {
+                let apart = a.target_from_source.to_homogeneous() - b.target_from_source.to_homogeneous();
+                assert!(apart.amax() < 0.1 * usual.resolution, "{name}: {shortcuts:?}: {apart}");
+                assert!((a.score - b.score).abs() < 0.01, "{name}: {shortcuts:?}");
+            }
         }
     }
-    let expected: BTreeSet<String> = cases().iter().map(|(scene, _)| scene.name.to_owned()).collect();
-    assert_eq!(names, expected);
 }

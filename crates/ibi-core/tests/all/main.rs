@@ -16,6 +16,7 @@ mod dense_graph;
 mod errors;
 mod evidence;
 mod features;
+mod floors;
 // Parameters in the golden files are JSON.
 #[cfg(feature = "serde")]
 mod golden;

@@ -1,7 +1,7 @@
 use crate::error::Error;
 use crate::kernels::by_target::ball;
 use crate::kernels::compatibility::{vote_reach, votes_until};
-use crate::params::at_least_3;
+use crate::ranges::at_least_3;
 use crate::stages::{Context, Enhance, Ranked};
 
 /// `voting`: every seed votes for every alive correspondence by their consistency; the `n_vot` with the most
@@ -31,7 +31,7 @@ impl Voting {
 
 impl Enhance for Voting {
     fn enhance(&self, context: &Context<'_>, seeds: &Ranked) -> Ranked {
-        let delta_r = context.params.delta_r_pr;
+        let delta_r = context.delta_r_pr;
         let by_target = &context.pairs.by_target;
         let voters = context.pairs.columns.gather(seeds.ids());
         // Whose target point lies farther from that of a seed than their source points can be apart has no vote from it.

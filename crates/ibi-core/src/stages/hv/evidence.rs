@@ -1,7 +1,7 @@
+use crate::detail::Detail;
 use crate::error::Error;
-use crate::kernels::evidence::Support;
-use crate::params::share;
-use crate::scene::Detail;
+use crate::evidence::Support;
+use crate::ranges::share;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
 /// `evidence`: accepts a pose if it is right with a probability of more than `t_score`.

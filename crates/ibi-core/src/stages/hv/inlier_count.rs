@@ -1,5 +1,5 @@
 use crate::error::Error;
-use crate::params::at_least_1;
+use crate::ranges::at_least_1;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
 /// `inlier_count`: accepts a pose if more than `t_inliers` alive correspondences have a residual below `t_he`.
@@ -28,7 +28,7 @@ impl InlierCount {
 
 impl Validate for InlierCount {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        let inliers = context.inliers(&hypothesis.target_from_source, context.params.t_he_pr);
+        let inliers = context.inliers(&hypothesis.target_from_source, context.scene.tolerances.t_he_pr);
         Verdict { value: inliers.len() as f64, threshold: self.t_inliers.into() }
     }
 }

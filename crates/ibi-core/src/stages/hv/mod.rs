@@ -11,7 +11,7 @@ pub use none::None;
 pub use overlap::Overlap;
 
 use super::{Context, Hypothesis, Validate, Verdict, variants};
-use crate::kernels::evidence::Support;
+use crate::evidence::Support;
 
 variants! {
     /// The ways to validate a hypothesis.

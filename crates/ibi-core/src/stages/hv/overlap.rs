@@ -1,6 +1,6 @@
 use crate::error::Error;
 use crate::kernels::overlap::{Place, overlap_of};
-use crate::params::share;
+use crate::ranges::share;
 use crate::stages::{Context, Hypothesis, Validate, Verdict};
 
 /// `overlap`: accepts a pose if more than `t_overlap` of the source points come to lie within `d_op` of a
@@ -36,11 +36,11 @@ impl Overlap {
 
 impl Validate for Overlap {
     fn validate(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Verdict {
-        let Context { scene, params, .. } = context;
+        let scene = context.scene;
         let pose = &hypothesis.target_from_source;
         let claims = context.claims.near(pose);
         let value = if self.exclusive && !claims.is_empty() {
-            let mut places = scene.places(params, pose);
+            let mut places = scene.places(pose);
             let on = places.iter().enumerate().filter_map(|(i, place)| match place {
                 Place::On(row) => Some((i, *row)),
                 _ => None,
@@ -53,7 +53,7 @@ impl Validate for Overlap {
             }
             overlap_of(&places)
         } else {
-            scene.overlap(params, pose)
+            scene.overlap(pose)
         };
         Verdict { value, threshold: self.t_overlap }
     }

@@ -2,7 +2,7 @@ use crate::error::Error;
 use crate::kernels::compatibility::{Payoff, payoff_matrix};
 use crate::kernels::otsu::otsu;
 use crate::kernels::replicator::replicator;
-use crate::params::{at_least_1, at_least_3, at_most};
+use crate::ranges::{at_least_1, at_least_3, at_most};
 use crate::stages::{Context, Ranked, SelectSeeds, Stage};
 
 /// Bins of the histogram in which Otsu's threshold is searched.
@@ -50,8 +50,7 @@ impl SelectSeeds for Gtm {
         // that the order of the input does not matter.
         let sample = context.rng(Stage::Scs).sample(context.alive.ids(), self.n_downsample as usize);
         let players = context.pairs.columns.gather(&sample);
-        let payoff =
-            payoff_matrix(&players, self.payoff, context.params.delta_r_pr, || context.interrupt.is_set());
+        let payoff = payoff_matrix(&players, self.payoff, context.delta_r_pr, || context.interrupt.is_set());
         let population = replicator(&payoff, self.n_gtm as usize, || context.interrupt.is_set());
         let Some(population) = population else { return Ranked::default() };
         // Equal shares have no threshold: nothing is to be told apart, so all are seeds.

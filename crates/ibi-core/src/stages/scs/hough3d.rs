@@ -1,11 +1,11 @@
 use nalgebra::{Matrix3, Point3, Vector3};
 
-use crate::cloud::PreparedCloud;
 use crate::error::Error;
 use crate::kernels::frames::frames;
 use crate::kernels::hough::peak;
 use crate::kernels::nearby::Nearby;
-use crate::params::positive;
+use crate::ranges::positive;
+use crate::scene::PreparedCloud;
 use crate::stages::{Context, Ranked, SelectSeeds};
 
 /// `hough3d`: each correspondence votes for where the centroid of the source lies in the target, by the local reference

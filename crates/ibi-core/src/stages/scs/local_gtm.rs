@@ -6,7 +6,7 @@ use crate::interrupt::Phase;
 use crate::kernels::graph::{EdgeTest, Graph};
 use crate::kernels::otsu::otsu;
 use crate::kernels::replicator::{Payoffs, replicator};
-use crate::params::{at_least_1, at_least_8, non_negative, positive};
+use crate::ranges::{at_least_1, at_least_8, non_negative, positive};
 use crate::stages::{Context, Ranked, SelectSeeds};
 
 /// Neighbourhoods of so few cannot be split by a histogram: seeds are those above a share of the largest.
@@ -50,7 +50,7 @@ pub struct LocalGtm {
     /// Where more correspondences than this lie around one, a first graph holds only so many of them, which is enough to
     /// find most instances in a fraction of the time. Once nothing more comes of it, a graph of all that are left takes
     /// its place. `None`: that one from the beginning. At least 8.
-    #[cfg_attr(feature = "serde", serde(deserialize_with = "crate::params::none_or"))]
+    #[cfg_attr(feature = "serde", serde(deserialize_with = "crate::ranges::none_or"))]
     pub first_look: Option<u32>,
     /// `N_gtm`: generations of the replicator. At least 1.
     pub n_gtm: u32,
@@ -165,7 +165,7 @@ impl SelectSeeds for LocalGtm {
     fn select_seeds(&self, context: &Context<'_>) -> Ranked {
         let graph = context.graph.get_or_init(|| self.build(context));
         let is_free = |node: u32| graph.is_alive(node) && !context.barred[graph.id(node) as usize];
-        let enough = context.params.t_s as usize;
+        let enough = context.t_s as usize;
         let mut leaders = Leaders::new(graph, |node| is_free(node) && graph.futile(node).is_none());
         let mut num_futile = 0;
         for leader in &mut leaders {

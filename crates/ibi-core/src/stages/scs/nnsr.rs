@@ -1,5 +1,5 @@
 use crate::error::{Argument, Error};
-use crate::params::at_least_3;
+use crate::ranges::at_least_3;
 use crate::stages::{Context, Ranked, SelectSeeds};
 
 /// `nnsr`: the alive correspondences of the most distinctive matches, by their nearest-neighbour similarity ratio, are the

@@ -1,7 +1,7 @@
 use super::{best_of, is_degenerate};
 use crate::error::Error;
 use crate::kernels::triplets::TopTriplets;
-use crate::params::{at_least_1, at_most, non_negative};
+use crate::ranges::{at_least_1, at_most, non_negative};
 use crate::stages::{Context, Estimate, EstimatePose, Ranked};
 
 /// Triplets looked at, at most, for each one wanted. Votes are alike where correspondences are neighbours, so

@@ -2,7 +2,7 @@ use nalgebra::Isometry3;
 
 use crate::error::Error;
 use crate::kernels::kabsch::rigid_fit;
-use crate::params::{at_least_1, at_most};
+use crate::ranges::{at_least_1, at_most};
 use crate::stages::{Context, Estimate, EstimatePose, Hypothesis, Ranked};
 
 /// Correspondences with at least this share of the most votes make the first fit.
@@ -45,7 +45,7 @@ impl EstimatePose for Irls {
                     break;
                 }
                 let wide = if refit < 2 { 2.0 } else { 1.0 };
-                match refitted(context, &pose, wide * context.params.t_he_pr) {
+                match refitted(context, &pose, wide * context.scene.tolerances.t_he_pr) {
                     Some(better) => pose = better,
                     None => break,
                 }

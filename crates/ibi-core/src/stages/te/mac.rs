@@ -1,7 +1,7 @@
 use super::{best_of, compatibility_graph};
 use crate::error::Error;
 use crate::kernels::cliques::{Limits, heaviest_cliques};
-use crate::params::{at_least_1, at_most, positive, share};
+use crate::ranges::{at_least_1, at_most, positive, share};
 use crate::stages::{Context, Estimate, EstimatePose, Ranked};
 
 /// `mac`: maximal cliques of the second-order compatibility graph over `C_d`, for each member the heaviest one that holds

@@ -87,7 +87,7 @@ fn best_of<S: AsRef<[u32]> + Sync>(context: &Context<'_>, samples: &[S]) -> Opti
             return None;
         }
         let pose = rigid_fit(context.pairs.pairs(samples[s].as_ref().iter().copied()))?;
-        Some((mae(context.alive.columns(), &pose, context.params.t_he_pr), pose))
+        Some((mae(context.alive.columns(), &pose, context.scene.tolerances.t_he_pr), pose))
     };
     let mut best: Option<(f32, Isometry3<f64>)> = None;
     for start in (0..samples.len()).step_by(SAMPLES_AT_A_TIME) {

@@ -1,6 +1,6 @@
 use super::{best_of, is_degenerate};
 use crate::error::Error;
-use crate::params::{at_least_1, at_most, non_negative};
+use crate::ranges::{at_least_1, at_most, non_negative};
 use crate::stages::{Context, Estimate, EstimatePose, Ranked, Stage};
 
 /// `ransac`: triplets drawn uniformly from `C_d` give a pose each; the one with the best MAE over the alive

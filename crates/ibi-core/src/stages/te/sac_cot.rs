@@ -1,7 +1,7 @@
 use super::{best_of, compatibility_graph, is_degenerate};
 use crate::error::Error;
 use crate::kernels::triangles::heaviest_triangles;
-use crate::params::{at_least_1, at_most, non_negative, positive, share};
+use crate::ranges::{at_least_1, at_most, non_negative, positive, share};
 use crate::stages::{Context, Estimate, EstimatePose, Ranked};
 
 /// `sac_cot`: the triangles of the compatibility graph over `C_d` with the largest sum of compatibilities give a pose

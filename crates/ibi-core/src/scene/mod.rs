@@ -1,26 +1,26 @@
 //! The two clouds of a run and what is known of them together: what lies near, resolution, what the camera measured.
 
+mod cloud;
+mod clouds;
+mod correspondence;
+mod tolerances;
+
 use nalgebra::{Isometry3, Point3};
 
-use crate::cloud::{PROBE_POINTS, PreparedCloud, SCOUT_POINTS};
-use crate::error::{Argument, Error};
+use crate::detail::Detail;
+use crate::error::Error;
 use crate::interrupt::Interrupt;
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::Nearby;
 use crate::kernels::overlap::{Contact, Fit, Place, Surface, chance_fit, fit, overlap, own_fit, places};
 use crate::kernels::rng::Rng;
 use crate::kernels::sight::{RangeImage, View};
-use crate::params::Params;
-use crate::stages::Stage;
 
-/// How many source points are looked at.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Detail {
-    /// 64, enough to see that a pose is hopeless; with a camera 256, of which it sees less than half.
-    Glance,
-    /// 256, enough to judge it; with a camera all.
-    Look,
-}
+pub use cloud::{Cloud, PreparedCloud};
+pub(crate) use cloud::{PROBE_POINTS, SCOUT_POINTS, check_points};
+pub(crate) use clouds::Clouds;
+pub use correspondence::{Alive, Correspondences, PointPairs};
+pub use tolerances::Tolerances;
 
 /// Both clouds of a run.
 #[derive(Debug)]
@@ -31,6 +31,8 @@ pub struct Scene<'a> {
     pub target: PreparedCloud<'a>,
     /// pr: the mean of the two clouds' spacings, or the value given in the parameters. Data units.
     pub resolution: f64,
+    /// When points of the two agree.
+    pub tolerances: Tolerances,
     /// The source points within the reach of all questions: 2 `d_op` or `t_he`, whichever is more.
     pub near_source: Nearby,
     /// The target points within the same reach.
@@ -39,70 +41,19 @@ pub struct Scene<'a> {
     pub measured: Option<RangeImage>,
 }
 
-/// Both clouds, found to fit together, and pr.
-pub(crate) struct Clouds<'a> {
-    pub(crate) source: &'a PreparedCloud<'a>,
-    pub(crate) target: PreparedCloud<'a>,
-    pub(crate) resolution: f64,
-}
-
-impl<'a> Clouds<'a> {
-    pub(crate) fn new(
-        source: &'a PreparedCloud<'a>,
-        target: PreparedCloud<'a>,
-        params: &Params,
-    ) -> Result<Self, Error> {
-        let (src, tgt) = (Argument::SrcNormals, Argument::TgtNormals);
-        match (&source.normals, &target.normals) {
-            (Some(_), None) => return Err(Error::NormalsOfOneCloud { given: src, missing: tgt }),
-            (None, Some(_)) => return Err(Error::NormalsOfOneCloud { given: tgt, missing: src }),
-            _ => {}
-        }
-        let (src, tgt) = (Argument::SrcFrames, Argument::TgtFrames);
-        match (&source.frames, &target.frames) {
-            (Some(_), None) => return Err(Error::FramesOfOneCloud { given: src, missing: tgt }),
-            (None, Some(_)) => return Err(Error::FramesOfOneCloud { given: tgt, missing: src }),
-            _ => {}
-        }
-        // Metres against millimetres would make pr so coarse that a whole cloud fits into one point, and any
-        // pose overlaps perfectly. The test needs no factor: below it no registration makes sense.
-        for (small, s, large, l) in
-            [(Argument::Src, source, Argument::Tgt, &target), (Argument::Tgt, &target, Argument::Src, source)]
-        {
-            if s.extent < l.spacing {
-                return Err(Error::DifferentUnits { small, extent: s.extent, large, spacing: l.spacing });
-            }
-        }
-        let resolution = params.resolution.unwrap_or(0.5 * (source.spacing + target.spacing));
-        if resolution <= 0.0 {
-            // Below what numbers can hold.
-            return Err(Error::NoExtent { argument: Argument::Src });
-        }
-        Ok(Self { source, target, resolution })
-    }
-
-    /// What lies near in each of them.
-    pub(crate) fn near(&self, params: &Params, interrupt: &Interrupt) -> Result<[Nearby; 2], Error> {
-        let usual = 2.0 * params.d_op_pr * self.resolution;
-        let reach = usual.max(params.t_he_pr * self.resolution);
-        let near = |points| Nearby::until(points, reach, usual, || interrupt.is_set());
-        let near = near(&self.source.points).zip(near(&self.target.points));
-        near.map(|(source, target)| [source, target]).ok_or_else(|| interrupt.error())
-    }
-}
-
 impl<'a> Scene<'a> {
     pub(crate) fn new(
         clouds: Clouds<'a>,
         [near_source, near_target]: [Nearby; 2],
         measured: Option<&[Point3<f64>]>,
-        params: &Params,
+        tolerances: Tolerances,
         interrupt: &Interrupt,
     ) -> Result<Self, Error> {
         interrupt.proceed()?;
         let Clouds { source, target, resolution } = clouds;
-        let mut scene = Self { source, target, resolution, near_source, near_target, measured: None };
-        if scene.is_one_sided(params)
+        let mut scene =
+            Self { source, target, resolution, tolerances, near_source, near_target, measured: None };
+        if scene.is_one_sided()
             && let Some(eye) = scene.target.viewpoint
         {
             // Now, not first from within a parallel map: both are one themselves.
@@ -117,18 +68,18 @@ impl<'a> Scene<'a> {
 }
 
 impl Scene<'_> {
-    /// Where each source point lies on the target once the pose has moved it, by `d_op` and, if the parameters
-    /// let normals count, by their agreement.
+    /// Where each source point lies on the target once the pose has moved it, by `d_op` and, if
+    /// normals count, by their agreement.
     #[must_use]
-    pub fn places(&self, params: &Params, target_from_source: &Isometry3<f64>) -> Vec<Place> {
-        let (source, target, contact) = self.surfaces(params, params.d_op_pr);
+    pub fn places(&self, target_from_source: &Isometry3<f64>) -> Vec<Place> {
+        let (source, target, contact) = self.surfaces(self.tolerances.d_op_pr);
         places(&source, &target, &self.near_target, target_from_source, &contact)
     }
 
     /// Share of the source points, of those that a camera can see, that lie on the target once the pose has moved them.
     #[must_use]
-    pub fn overlap(&self, params: &Params, target_from_source: &Isometry3<f64>) -> f64 {
-        let (source, target, contact) = self.surfaces(params, params.d_op_pr);
+    pub fn overlap(&self, target_from_source: &Isometry3<f64>) -> f64 {
+        let (source, target, contact) = self.surfaces(self.tolerances.d_op_pr);
         overlap(&source, &target, &self.near_target, target_from_source, &contact)
     }
 
@@ -136,31 +87,28 @@ impl Scene<'_> {
     #[must_use]
     pub fn fit(
         &self,
-        params: &Params,
         detail: Detail,
         target_from_source: &Isometry3<f64>,
         are_claimed: impl Fn(&[u32]) -> Vec<bool> + Sync,
     ) -> Fit {
-        let (source, target, contact) = self.probed(params, detail);
+        let (source, target, contact) = self.probed(detail);
         fit(&source, &target, &self.near_target, target_from_source, &contact, are_claimed)
     }
 
     /// The fit that chance gives a pose somewhere on the target.
     #[must_use]
-    pub fn chance_fit(&self, params: &Params) -> f64 {
-        let (source, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-        let rng = Rng::new(params.seed, 0, Stage::Hv as u32);
+    pub fn chance_fit(&self, rng: Rng) -> f64 {
+        let (source, target, contact) = self.surfaces(2.0 * self.tolerances.d_op_pr);
         chance_fit(&source, &target, &self.near_target, &contact, rng, CHANCE_SAMPLES)
     }
 
     /// The fit that the noise of the target lets a pose have: 1 unless the scene is seen from one side.
     #[must_use]
-    pub fn best_fit(&self, params: &Params) -> f64 {
-        if !self.is_one_sided(params) {
+    pub fn best_fit(&self, rng: Rng) -> f64 {
+        if !self.is_one_sided() {
             return 1.0;
         }
-        let (_, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-        let rng = Rng::new(params.seed, 1, Stage::Hv as u32);
+        let (_, target, contact) = self.surfaces(2.0 * self.tolerances.d_op_pr);
         own_fit(&target, &self.near_target, &contact, rng, CHANCE_SAMPLES)
     }
 
@@ -200,13 +148,8 @@ impl Scene<'_> {
     /// The pose polished on the two clouds by ICP within 2 `d_op`: on few points for a first glance, which brings a
     /// poor pose most of the way at a quarter of the cost, or on more.
     #[must_use]
-    pub fn icp(
-        &self,
-        params: &Params,
-        detail: Detail,
-        target_from_source: &Isometry3<f64>,
-    ) -> Isometry3<f64> {
-        let (source, target, contact) = self.probed(params, detail);
+    pub fn icp(&self, detail: Detail, target_from_source: &Isometry3<f64>) -> Isometry3<f64> {
+        let (source, target, contact) = self.probed(detail);
         let stop = match detail {
             Detail::Glance => Stop { max_visible: 2 * SCOUT_POINTS, ..Stop::new(10, 0.02) },
             // Point-to-plane may come from far, and comes to rest; point-to-point creeps on.
@@ -219,17 +162,18 @@ impl Scene<'_> {
     }
 
     /// Whether source points that a camera cannot see are left out.
-    pub(crate) fn is_one_sided(&self, params: &Params) -> bool {
-        let with_normals = params.min_normal_cos.is_some() && self.source.normals.is_some();
-        with_normals && params.oriented_normals && self.target.viewpoint.is_some()
+    pub(crate) fn is_one_sided(&self) -> bool {
+        let Tolerances { min_normal_cos, oriented_normals, .. } = self.tolerances;
+        let with_normals = min_normal_cos.is_some() && self.source.normals.is_some();
+        with_normals && oriented_normals && self.target.viewpoint.is_some()
     }
 
     /// A few source points against the target within a reach of 2 `d_op`; more if they are seen from one side: then few
     /// of them can be seen.
-    fn probed(&self, params: &Params, detail: Detail) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
-        let (all, target, contact) = self.surfaces(params, 2.0 * params.d_op_pr);
-        let contact = Contact { view: self.view(params, detail), ..contact };
-        let with_normals = params.min_normal_cos.is_some();
+    fn probed(&self, detail: Detail) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
+        let (all, target, contact) = self.surfaces(2.0 * self.tolerances.d_op_pr);
+        let contact = Contact { view: self.view(detail), ..contact };
+        let with_normals = self.tolerances.min_normal_cos.is_some();
         let [scout, probe] =
             [&self.source.scout, &self.source.probe].map(|probe| probe.surface(with_normals));
         let source = match (detail, contact.view) {
@@ -240,19 +184,20 @@ impl Scene<'_> {
         (source, target, contact)
     }
 
-    fn view(&self, params: &Params, detail: Detail) -> Option<View<'_>> {
-        let eye = self.target.viewpoint.filter(|_| self.is_one_sided(params))?;
+    fn view(&self, detail: Detail) -> Option<View<'_>> {
+        let eye = self.target.viewpoint.filter(|_| self.is_one_sided())?;
         Some(View { eye, own: self.source.own_shadow(detail), measured: self.measured.as_ref() })
     }
 
-    fn surfaces(&self, params: &Params, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
-        let with_normals = params.min_normal_cos.is_some();
+    fn surfaces(&self, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
+        let Tolerances { min_normal_cos, oriented_normals, .. } = self.tolerances;
+        let with_normals = min_normal_cos.is_some();
         let contact = Contact {
             distance: distance_pr * self.resolution,
-            min_normal_cos: params.min_normal_cos.unwrap_or(-1.0),
-            oriented: params.oriented_normals,
-            view: self.view(params, Detail::Look),
-            to_planes: self.is_one_sided(params),
+            min_normal_cos: min_normal_cos.unwrap_or(-1.0),
+            oriented: oriented_normals,
+            view: self.view(Detail::Look),
+            to_planes: self.is_one_sided(),
         };
         (self.source.surface(with_normals), self.target.surface(with_normals), contact)
     }

@@ -2,19 +2,16 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::ledger::Ledger;
-use crate::params::Params;
+use super::ledger::Ledger;
 use crate::scene::Scene;
-use crate::state::Found;
 
 /// Which scene points accepted instances explain. It is worked out when asked: most poses meet no other, and then
 /// there is nothing to work out.
 #[derive(Debug, Clone, Copy)]
 pub struct Claims<'a> {
     scene: &'a Scene<'a>,
-    /// `d_op` in pr.
-    distance_pr: f64,
-    found: &'a [Found],
+    /// Of the instances, in the order they were found.
+    poses: &'a [Isometry3<f64>],
     /// An instance against all others: its is what it is nearest to.
     defendant: Option<usize>,
     /// Who explains what, where that was worked out for all beforehand, and who competes no more.
@@ -23,8 +20,8 @@ pub struct Claims<'a> {
 
 impl<'a> Claims<'a> {
     /// What is not free any more: the claims of all.
-    pub(crate) fn new(scene: &'a Scene<'a>, params: &Params, found: &'a [Found]) -> Self {
-        Self { scene, distance_pr: params.d_op_pr, found, defendant: None, ledger: None }
+    pub(crate) fn new(scene: &'a Scene<'a>, poses: &'a [Isometry3<f64>]) -> Self {
+        Self { scene, poses, defendant: None, ledger: None }
     }
 
     /// What others of the ledger explain better than the instance does; of equals the one found first.
@@ -35,7 +32,8 @@ impl<'a> Claims<'a> {
     /// The poses of the instances that claim, in the order they were found.
     pub fn poses(&self) -> impl Iterator<Item = &'a Isometry3<f64>> + use<'a> {
         let claims = *self;
-        (0..self.found.len()).filter(move |&at| claims.is_claimant(at)).map(move |at| claims.found[at].pose())
+        let poses = claims.poses.iter().enumerate();
+        poses.filter(move |&(at, _)| claims.is_claimant(at)).map(|(_, pose)| pose)
     }
 
     /// Whether an accepted instance explains a row of the target. For many rows near one pose ask [`Self::near`].
@@ -51,9 +49,8 @@ impl<'a> Claims<'a> {
     }
 
     fn of(&self, centre: Option<Point3<f64>>) -> NearClaims<'a> {
-        let Self { scene, distance_pr, .. } = *self;
-        let near = (0..self.found.len()).filter(|&at| {
-            let is_near = |centre| are_near(scene, distance_pr, self.found[at].pose(), centre);
+        let near = (0..self.poses.len()).filter(|&at| {
+            let is_near = |centre| are_near(self.scene, &self.poses[at], centre);
             self.is_claimant(at) && centre.as_ref().is_none_or(is_near)
         });
         NearClaims { claims: *self, centre, near: near.collect() }
@@ -70,19 +67,15 @@ impl<'a> Claims<'a> {
         rows: impl Iterator<Item = (usize, u32)>,
     ) -> impl Iterator<Item = (usize, f64)> {
         let points = rows.map(|(key, row)| (key, self.scene.target.points[row as usize]));
-        let explained = self.scene.nearest_source(self.distance_pr, self.found[instance].pose(), points);
+        let explained =
+            self.scene.nearest_source(self.scene.tolerances.d_op_pr, &self.poses[instance], points);
         explained.into_iter().map(|(key, _, gap)| (key, gap))
     }
 }
 
 /// Whether a pose can explain target points within 2 `d_op` of the source where another one has moved its centre to `centre`.
-pub(crate) fn are_near(
-    scene: &Scene<'_>,
-    distance_pr: f64,
-    pose: &Isometry3<f64>,
-    centre: &Point3<f64>,
-) -> bool {
-    let reach = 2.0 * scene.source.radius + 3.0 * distance_pr * scene.resolution;
+pub(crate) fn are_near(scene: &Scene<'_>, pose: &Isometry3<f64>, centre: &Point3<f64>) -> bool {
+    let reach = 2.0 * scene.source.radius + 3.0 * scene.tolerances.d_op_pr * scene.resolution;
     (pose * scene.source.centre - centre).norm() <= reach
 }
 
@@ -99,12 +92,10 @@ impl NearClaims<'_> {
     /// Which of `rows` of the target one of the instances explains.
     #[must_use]
     pub fn contain(&self, rows: &[u32]) -> Vec<bool> {
-        let Claims { scene, distance_pr, found, defendant, ledger } = self.claims;
+        let Claims { scene, poses, defendant, ledger } = self.claims;
         let Some(ledger) = ledger.filter(|_| !self.near.is_empty()) else { return self.worked_out(rows) };
         let is_near = |instance: usize| {
-            self.centre
-                .as_ref()
-                .is_none_or(|centre| are_near(scene, distance_pr, found[instance].pose(), centre))
+            self.centre.as_ref().is_none_or(|centre| are_near(scene, &poses[instance], centre))
         };
         let known: Vec<Option<bool>> =
             rows.iter().map(|&row| ledger.is_claimed(row, defendant, is_near)).collect();

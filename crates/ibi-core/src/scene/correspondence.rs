@@ -4,15 +4,13 @@ use std::sync::{Arc, OnceLock};
 
 use nalgebra::{Point3, Vector3};
 
-use crate::cloud::{PreparedCloud, check_points};
+use super::cloud::{PreparedCloud, check_points};
+use super::clouds::Clouds;
 use crate::error::{Argument, Error};
 use crate::interrupt::Interrupt;
 use crate::kernels::by_target::ByTarget;
 use crate::kernels::columns::Columns;
-use crate::kernels::graph::{PairNormals, up_to_sign};
-use crate::kernels::par;
-use crate::params::Params;
-use crate::scene::{Clouds, Scene};
+use crate::kernels::graph::PairNormals;
 
 /// Correspondences as a user hands them in: nothing is checked until a [`crate::Registrar`] takes them.
 ///
@@ -157,39 +155,6 @@ impl PointPairs {
             normals,
             are_rows,
         })
-    }
-
-    /// For each source point the share of the correspondences whose source point lies within `t_he` of it (and
-    /// agrees in its normal, where normals count): how likely a correspondence that knows nothing of its target
-    /// point would agree there.
-    pub(crate) fn chances(&self, scene: &Scene<'_>, params: &Params, interrupt: &Interrupt) -> Vec<f32> {
-        /// Points of like normals that are looked at around one, at most.
-        const MOST_NEAR: usize = 1 << 12;
-        let source = scene.source;
-        let t_he = params.t_he_pr * scene.resolution;
-        let is_wide = scene.near_source.is_crowded(t_he);
-        let mut uses = vec![0_u32; source.points.len()];
-        for &row in &self.source_rows {
-            uses[row as usize] += 1;
-        }
-        let near = if let Some((n, min_cos)) = source.normals.as_deref().zip(params.min_normal_cos) {
-            par::map(source.points.len(), 512, |row| {
-                if row % 64 == 0 && interrupt.is_set() {
-                    return 0;
-                }
-                let alike = |&other: &u32| {
-                    up_to_sign(n[row].dot(&n[other as usize]), params.oriented_normals) >= min_cos
-                };
-                let near = || scene.near_source.within(&source.points[row], t_he);
-                // Of more than so many every so many-th stands for all.
-                let step = if is_wide { near().count().div_ceil(MOST_NEAR).max(1) } else { 1 };
-                let near = near().step_by(step).filter(alike);
-                near.map(|other| uses[other as usize]).sum::<u32>().saturating_mul(step as u32)
-            })
-        } else {
-            scene.near_source.sums_within_until(t_he, &source.points, &uses, || interrupt.is_set())
-        };
-        near.into_iter().map(|num| num as f32 / self.len().max(1) as f32).collect()
     }
 
     /// M, the number of correspondences.

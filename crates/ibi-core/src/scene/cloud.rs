@@ -7,16 +7,16 @@ use std::sync::OnceLock;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::checks::{first_not_finite, unit_vectors};
+use crate::detail::Detail;
 use crate::error::{Argument, Error};
 use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::columns::middle;
+use crate::kernels::diameter::diameter;
 use crate::kernels::nearby::spacing_until;
 use crate::kernels::neighbors::Neighbors;
 use crate::kernels::overlap::Surface;
 use crate::kernels::rng::Rng;
 use crate::kernels::sight::OwnShadow;
-use crate::metrics::diameter;
-use crate::scene::Detail;
 use crate::symmetries::Symmetries;
 
 /// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
@@ -206,7 +206,7 @@ impl PreparedCloud<'_> {
             return Some(known);
         }
         // Not from within `get_or_init`: threads that wait for each other there could be those that have the work to do.
-        let diameter = diameter(&self.points, interrupt).ok()?;
+        let diameter = diameter(&self.points, interrupt)?;
         Some(*self.diameter.get_or_init(|| diameter))
     }
 

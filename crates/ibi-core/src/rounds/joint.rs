@@ -7,17 +7,17 @@ use std::sync::Mutex;
 
 use nalgebra::Point3;
 
-use crate::claims::are_near;
-use crate::correspondence::Alive;
-use crate::finish::Grace;
+use super::instances::{Instance, Instances};
+use super::problem::Problem;
+use super::stages::Stages;
+use super::state::State;
+use crate::detail::Detail;
+use crate::evidence::{Ledger, Support, are_near};
+use crate::grace::Grace;
 use crate::interrupt::Phase;
-use crate::kernels::evidence::Support;
 use crate::kernels::par;
-use crate::ledger::Ledger;
-use crate::params::Params;
-use crate::scene::Detail;
+use crate::scene::Alive;
 use crate::stages::{Context, Validate, Verdict};
-use crate::state::{Found, Problem};
 
 /// What `ask` answers of an instance where only that is free which no other one is nearer to. `context` is that of all
 /// correspondences and all instances.
@@ -25,7 +25,7 @@ fn alone<T>(
     context: &Context<'_>,
     ledger: &Ledger<'_>,
     instance: usize,
-    found: &Found,
+    found: &Instance,
     ask: impl FnOnce(&Context<'_>) -> T,
 ) -> T {
     let claims = context.claims.against(instance, ledger);
@@ -33,7 +33,8 @@ fn alone<T>(
     if near.is_empty() {
         return ask(&Context { claims, ..*context });
     }
-    let around = context.around(2.0 * context.params.d_op_pr, found.pose());
+    let reach_pr = 2.0 * context.scene.tolerances.d_op_pr;
+    let around = context.witnesses().around(reach_pr, found.pose());
     let rows: Vec<u32> = around.iter().map(|&id| context.pairs.target_rows[id as usize]).collect();
     let claimed = around.iter().zip(near.contain(&rows)).filter(|&(_, is_claimed)| is_claimed);
     let claimed: Vec<u32> = claimed.map(|(&id, _)| id).collect();
@@ -42,44 +43,28 @@ fn alone<T>(
     ask(&Context { claims, alive: &alive, ..*context })
 }
 
-/// What speaks for each instance where they do not compete. Those for which there is no time are dropped.
-pub(crate) fn supports(
-    problem: &Problem<'_>,
-    params: &Params,
-    found: &mut Vec<Found>,
-    grace: &mut Grace<'_>,
-) -> Vec<Support> {
-    problem.interrupt.begin(Phase::JointCheck);
-    let everything = Alive::all(&problem.pairs);
-    let context = problem.context_of(params, 0, &everything, found);
-    let cost = problem.cost_of_look(params);
-    let supports =
-        grace.map(found.len(), |_| cost, |at| context.support(Detail::Look, found[at].pose(), false));
-    let mut is_kept = supports.iter().map(Option::is_some).collect::<Vec<bool>>().into_iter();
-    found.retain(|_| is_kept.next().unwrap_or_default());
-    supports.into_iter().flatten().collect()
-}
-
-/// Drops the poses that fail validation on what is their own, the worst first; returns what speaks for each of the others.
-///
-/// Once the run is ended and the time for this is over, all that fail go at once, and so do those that have not been measured
-/// yet; the others keep what spoke for them among all: less than there would be without those.
-pub(crate) fn joint_check(
-    problem: &Problem<'_>,
-    params: &Params,
-    hv: &dyn Validate,
-    found: &mut Vec<Found>,
-    grace: &mut Grace<'_>,
-) -> Vec<Support> {
-    problem.interrupt.begin(Phase::JointCheck);
-    let everything = Alive::all(&problem.pairs);
-    let mut measured: Vec<Option<Own>> = {
-        let context = problem.context_of(params, 0, &everything, found);
-        Check { problem, params, hv, context, found, cost: problem.cost_of(params, hv) }.run(grace)
-    };
-    let mut is_kept = measured.iter().map(Option::is_some).collect::<Vec<bool>>().into_iter();
-    found.retain(|_| is_kept.next().unwrap_or_default());
-    measured.drain(..).flatten().map(|own| own.support).collect()
+impl State<'_> {
+    /// What speaks for each instance. With `joint_check` the poses that fail validation on what is their own are dropped, the
+    /// worst first.
+    ///
+    /// Those for which there is no time are dropped. Once the run is ended and the time for the joint check is over, all that
+    /// fail go at once, and so do those that have not been measured yet; the others keep what spoke for them among all: less
+    /// than there would be without those.
+    pub(crate) fn supports(&mut self, stages: &Stages<'_>, grace: &mut Grace<'_>) -> Vec<Support> {
+        let Self { problem, instances, .. } = self;
+        problem.interrupt.begin(Phase::JointCheck);
+        let everything = Alive::all(&problem.pairs);
+        let context = Context { alive: &everything, ..problem.context(stages.params, 0, instances.poses()) };
+        if !stages.params.joint_check {
+            let cost = problem.cost_of_look();
+            let support = |at: usize| context.support(Detail::Look, instances[at].pose(), false);
+            let supports = grace.map(instances.len(), |_| cost, support);
+            return instances.keep(supports);
+        }
+        let (hv, cost) = (stages.hv, problem.cost_of(stages.hv));
+        let measured = Check { problem, hv, context, instances, cost }.run(grace);
+        instances.keep(measured).into_iter().map(|own| own.support).collect()
+    }
 }
 
 /// Where no pose is near more others than this each is asked for each, which is quicker than a ledger of so few.
@@ -87,10 +72,9 @@ const FEW_NEAR: usize = 16;
 
 struct Check<'a> {
     problem: &'a Problem<'a>,
-    params: &'a Params,
     hv: &'a dyn Validate,
     context: Context<'a>,
-    found: &'a [Found],
+    instances: &'a Instances,
     /// Of measuring one.
     cost: usize,
 }
@@ -98,20 +82,18 @@ struct Check<'a> {
 impl Check<'_> {
     /// What is left, and what it is worth.
     fn run(&self, grace: &mut Grace<'_>) -> Vec<Option<Own>> {
-        let Self { problem, params, found, .. } = *self;
+        let Self { problem, instances, .. } = *self;
+        let found = instances.poses();
         let scene = &problem.scene;
-        let poses = found.iter().map(|found| *found.pose()).collect();
-        let centres: Vec<Point3<f64>> =
-            found.iter().map(|found| found.pose() * scene.source.centre).collect();
-        let are_near =
-            |a: usize, b: usize| a != b && are_near(scene, params.d_op_pr, found[a].pose(), &centres[b]);
+        let centres: Vec<Point3<f64>> = found.iter().map(|pose| pose * scene.source.centre).collect();
+        let are_near = |a: usize, b: usize| a != b && are_near(scene, &found[a], &centres[b]);
         let mut num_near =
             par::map(found.len(), 256, |a| (0..found.len()).filter(|&b| are_near(b, a)).count());
-        let mut ledger = Ledger::new(scene, params.d_op_pr, poses);
+        let mut ledger = Ledger::new(scene, found.to_vec());
         let disputed: Vec<usize> = (0..found.len()).filter(|&at| num_near[at] > 0).collect();
         let are_many = num_near.iter().any(|&num| num > FEW_NEAR);
         if are_many {
-            let rows = grace.map(disputed.len(), |_| self.cost, |i| self.rows(&found[disputed[i]]));
+            let rows = grace.map(disputed.len(), |_| self.cost, |i| self.rows(&instances[disputed[i]]));
             ledger.enter(rows.into_iter().flatten().flatten(), &disputed, self.cost, grace);
         }
         // Correspondences need not be points of the clouds: then a row may matter to an instance that is far from it.
@@ -125,7 +107,8 @@ impl Check<'_> {
                 |_| self.cost,
                 |i| {
                     let at = stale[i];
-                    alone(&self.context, &ledger, at, &found[at], |own| Own::new(own, self.hv, &found[at]))
+                    let found = &instances[at];
+                    alone(&self.context, &ledger, at, found, |own| Own::new(own, self.hv, found))
                 },
             );
             let is_complete = anew.iter().all(Option::is_some);
@@ -152,7 +135,7 @@ impl Check<'_> {
                     num_near[at] -= 1;
                     is_stale[at] |= num_near[at] == 0;
                 }
-                is_stale[at] |= asks_all && problem.are_near(params, found[at].pose(), found[worst].pose());
+                is_stale[at] |= asks_all && problem.are_near(&found[at], &found[worst]);
             }
             for at in 0..found.len() {
                 is_stale[at] &= measured[at].is_some();
@@ -161,12 +144,13 @@ impl Check<'_> {
     }
 
     /// The rows of the target that will be asked for an instance.
-    fn rows(&self, found: &Found) -> Vec<u32> {
-        let Self { problem, params, context, .. } = self;
-        let around = context.around(2.0 * params.d_op_pr, found.pose());
+    fn rows(&self, found: &Instance) -> Vec<u32> {
+        let Self { problem, context, .. } = self;
+        let reach_pr = 2.0 * problem.scene.tolerances.d_op_pr;
+        let around = context.witnesses().around(reach_pr, found.pose());
         let rows: Vec<u32> = around.iter().map(|&id| problem.pairs.target_rows[id as usize]).collect();
         let rows = Mutex::new(rows);
-        let _ = problem.scene.fit(params, Detail::Look, found.pose(), |asked| {
+        let _ = problem.scene.fit(Detail::Look, found.pose(), |asked| {
             if let Ok(mut rows) = rows.lock() {
                 rows.extend(asked);
             }
@@ -185,7 +169,7 @@ struct Own {
 }
 
 impl Own {
-    fn new(context: &Context<'_>, hv: &dyn Validate, found: &Found) -> Self {
+    fn new(context: &Context<'_>, hv: &dyn Validate, found: &Instance) -> Self {
         let support = context.support(Detail::Look, found.pose(), true);
         let is_disputed = !context.claims.near(found.pose()).is_empty();
         let verdict = || hv.verdict_of(&support).unwrap_or_else(|| hv.validate(context, &found.hypothesis));

@@ -2,10 +2,9 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::MetricsError;
+use super::discs::{Disc, LEAF};
+use super::par;
 use crate::interrupt::{Interrupt, Phase};
-use crate::kernels::discs::{Disc, LEAF};
-use crate::kernels::par;
 use crate::pace::Pace;
 
 /// Slack of the pruning bound: rounding may make a sum of two radii fall short of the true bound by a few
@@ -31,32 +30,19 @@ const GRAIN: usize = 1 << 14;
 /// the search begins. If more than 4096 points are left, as on a sphere, they are sorted into flat discs
 /// and pairs of discs are compared: then the answer may fall short by 1e-14 of it, a few units in the last place.
 ///
-/// # Errors
-///
-/// [`MetricsError::Interrupted`].
+/// `None` if interrupted.
 ///
 /// # Complexity
 ///
 /// O(n) for the elongated shapes most parts are; about O(n log n) for points all about equally far
 /// from the centroid.
-///
-/// # Examples
-///
-/// ```
-/// use ibi_core::Interrupt;
-/// use ibi_core::metrics::diameter;
-/// use nalgebra::Point3;
-///
-/// let box_corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 2.0, 2.0]].map(Point3::from);
-/// assert_eq!(diameter(&box_corners, &Interrupt::never())?, 3.0);
-/// # Ok::<(), ibi_core::metrics::MetricsError>(())
-/// ```
-pub fn diameter(points: &[Point3<f64>], interrupt: &Interrupt) -> Result<f64, MetricsError> {
+#[must_use]
+pub(crate) fn diameter(points: &[Point3<f64>], interrupt: &Interrupt) -> Option<f64> {
     if !interrupt.enter(Phase::Diameter) {
-        return Err(MetricsError::Interrupted);
+        return None;
     }
     if points.len() < 2 {
-        return Ok(0.0);
+        return Some(0.0);
     }
     let sums = par::chunks(points.len(), GRAIN, |run| {
         points[run].iter().fold(Vector3::zeros(), |sum, p| sum + p.coords)
@@ -80,11 +66,7 @@ pub fn diameter(points: &[Point3<f64>], interrupt: &Interrupt) -> Result<f64, Me
 }
 
 /// The point farthest from `from`, the first of equals, and its distance.
-fn farthest(
-    points: &[Point3<f64>],
-    from: &Point3<f64>,
-    interrupt: &Interrupt,
-) -> Result<(Point3<f64>, f64), MetricsError> {
+fn farthest(points: &[Point3<f64>], from: &Point3<f64>, interrupt: &Interrupt) -> Option<(Point3<f64>, f64)> {
     let farther =
         |best: (Point3<f64>, f64), next: (Point3<f64>, f64)| if next.1 > best.1 { next } else { best };
     let parts = par::chunks(points.len(), GRAIN, |run| {
@@ -94,9 +76,9 @@ fn farthest(
         points[run].iter().map(|p| (*p, (p - from).norm())).fold((*from, 0.0), farther)
     });
     if interrupt.is_set() {
-        return Err(MetricsError::Interrupted);
+        return None;
     }
-    Ok(parts.into_iter().fold((*from, 0.0), farther))
+    Some(parts.into_iter().fold((*from, 0.0), farther))
 }
 
 /// The longest pair, at least `longest`, of points with their distances from one place: the tail of pairs of a point
@@ -105,7 +87,7 @@ fn compare_all(
     mut by_radius: Vec<(f64, Point3<f64>)>,
     mut longest: f64,
     interrupt: &Interrupt,
-) -> Result<f64, MetricsError> {
+) -> Option<f64> {
     by_radius.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
     let mut pace = Pace::new(interrupt);
     for (rank, (radius, p)) in by_radius.iter().enumerate() {
@@ -115,7 +97,7 @@ fn compare_all(
             break;
         }
         if pace.is_over(rest.len()) {
-            return Err(MetricsError::Interrupted);
+            return None;
         }
         for (other_radius, q) in rest {
             if (radius + other_radius) * ROUNDING < longest {
@@ -124,7 +106,7 @@ fn compare_all(
             longest = longest.max((p - q).norm());
         }
     }
-    Ok(longest)
+    Some(longest)
 }
 
 /// Pairs of discs that are handed to threads, about.
@@ -135,17 +117,12 @@ const SWEEPS: usize = 16;
 
 /// The same by a tree of discs, as a smooth surface has them: then what bounds a pair of discs is too large by the square of
 /// their size only, and of each disc few others are in question.
-fn compare_discs(
-    mut points: Vec<Point3<f64>>,
-    mut longest: f64,
-    interrupt: &Interrupt,
-) -> Result<f64, MetricsError> {
+fn compare_discs(mut points: Vec<Point3<f64>>, mut longest: f64, interrupt: &Interrupt) -> Option<f64> {
     for k in 0..SWEEPS {
         let (end, _) = farthest(&points, &points[k * points.len() / SWEEPS], interrupt)?;
         longest = longest.max(farthest(&points, &end, interrupt)?.1);
     }
-    let root =
-        Disc::new(&mut points, 0, &|p: &Point3<f64>| *p, interrupt).ok_or(MetricsError::Interrupted)?;
+    let root = Disc::new(&mut points, 0, &|p: &Point3<f64>| *p, interrupt)?;
     // The tasks are the same on any number of threads, and none knows of what another one has found.
     let mut tasks = vec![(&root, &root)];
     loop {
@@ -161,11 +138,7 @@ fn compare_discs(
         descend(&points, tasks[i], &mut longest, &mut pace);
         longest
     });
-    if interrupt.is_set() {
-        Err(MetricsError::Interrupted)
-    } else {
-        Ok(found.into_iter().fold(longest, f64::max))
-    }
+    if interrupt.is_set() { None } else { Some(found.into_iter().fold(longest, f64::max)) }
 }
 
 /// Whether a pair may be longer, by more than [`NEGLIGIBLE`], if it is no longer than the bound.
@@ -196,9 +169,10 @@ fn descend(points: &[Point3<f64>], (a, b): (&Disc, &Disc), longest: &mut f64, pa
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::float_cmp, reason = "tests may panic, and compare what is exact")]
 mod tests {
-    use super::super::strategies::{isometries, points};
     use super::*;
+    use crate::metrics::strategies::{isometries, points};
     use proptest::prelude::*;
 
     fn exact(points: &[Point3<f64>]) -> f64 {

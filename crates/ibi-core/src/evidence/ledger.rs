@@ -5,7 +5,7 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::finish::Grace;
+use crate::grace::Grace;
 use crate::kernels::par;
 use crate::scene::Scene;
 
@@ -24,8 +24,6 @@ const BLOCK: usize = 64;
 #[derive(Debug)]
 pub(crate) struct Ledger<'a> {
     scene: &'a Scene<'a>,
-    /// `d_op` in pr.
-    distance_pr: f64,
     poses: Vec<Isometry3<f64>>,
     is_out: Vec<bool>,
     /// For each row of the target one more than its place in `rows`, or 0. Empty if no row matters.
@@ -59,11 +57,10 @@ impl Row {
 
 impl<'a> Ledger<'a> {
     /// A ledger of `poses`, without a row yet.
-    pub(crate) fn new(scene: &'a Scene<'a>, distance_pr: f64, poses: Vec<Isometry3<f64>>) -> Self {
+    pub(crate) fn new(scene: &'a Scene<'a>, poses: Vec<Isometry3<f64>>) -> Self {
         let n = poses.len();
         Self {
             scene,
-            distance_pr,
             poses,
             is_out: vec![false; n],
             places: Vec::new(),
@@ -121,7 +118,7 @@ impl<'a> Ledger<'a> {
     fn explained(&self, instance: usize) -> Vec<(u32, f64)> {
         let (scene, pose) = (self.scene, &self.poses[instance]);
         // More than a row can be away, for rounding.
-        let reach = scene.source.radius + 2.0 * self.distance_pr * scene.resolution;
+        let reach = scene.source.radius + 2.0 * scene.tolerances.d_op_pr * scene.resolution;
         let near = scene.near_target.within(&(pose * scene.source.centre), reach);
         let mut places: Vec<u32> = near.filter_map(|row| self.places[row as usize].checked_sub(1)).collect();
         places.sort_unstable();
@@ -131,7 +128,8 @@ impl<'a> Ledger<'a> {
     /// The same of some places.
     fn explained_of(&self, instance: usize, places: &[u32]) -> Vec<(u32, f64)> {
         let points = places.iter().map(|&place| (place, self.point(place)));
-        let explained = self.scene.nearest_source(self.distance_pr, &self.poses[instance], points);
+        let explained =
+            self.scene.nearest_source(self.scene.tolerances.d_op_pr, &self.poses[instance], points);
         explained.into_iter().map(|(place, _, gap)| (place, gap)).collect()
     }
 
@@ -186,7 +184,7 @@ impl<'a> Ledger<'a> {
     fn each_around(&self, place: u32, mut found: impl FnMut(usize)) {
         let (scene, point) = (self.scene, self.point(place));
         // More than it can be away, for rounding.
-        let reach = scene.source.radius + 2.5 * self.distance_pr * scene.resolution;
+        let reach = scene.source.radius + 2.5 * scene.tolerances.d_op_pr * scene.resolution;
         for (instance, pose) in self.poses.iter().enumerate() {
             if self.holds(instance) && (pose * scene.source.centre - point).norm() <= reach {
                 found(instance);

@@ -1,0 +1,145 @@
+//! The contest: a pose that passed validation waits for better ones of the same instance before it becomes one.
+
+use std::time::Instant;
+
+use super::judge::Judged;
+use super::memory::Tried;
+use super::stages::Stages;
+use super::state::State;
+use crate::grace::Grace;
+use crate::interrupt::Phase;
+use crate::params::{Params, Removal};
+use crate::stages::Hypothesis;
+
+/// A contest accepts nothing below this share of its best value.
+const MARGIN: f64 = 0.8;
+
+/// Who competes, and since when.
+#[derive(Debug, Default)]
+pub(crate) struct Contest {
+    pub(super) candidates: Vec<Candidate>,
+    num_rounds: u32,
+}
+
+/// A hypothesis that passed validation and waits for the end of the contest.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Candidate {
+    pub(super) hypothesis: Hypothesis,
+    pub(super) value: f64,
+    pub(super) round: u32,
+    /// How many instances had claimed their points when it was measured.
+    measured_at: u32,
+}
+
+impl Contest {
+    /// Whether it has lasted long enough.
+    pub(super) fn is_due(&self, params: &Params) -> bool {
+        self.num_rounds >= params.n_contest
+    }
+
+    /// The row of the best candidate; of equals that of the earliest round.
+    pub(super) fn best(&self) -> Option<usize> {
+        let order = |a: &Candidate, b: &Candidate| a.value.total_cmp(&b.value).then(b.round.cmp(&a.round));
+        self.candidates.iter().enumerate().max_by(|(_, a), (_, b)| order(a, b)).map(|(at, _)| at)
+    }
+}
+
+impl State<'_> {
+    /// Enters the pose of the round just booked, if it passed. Of two that are the same pose the better one stays; only one
+    /// that is new counts as a success.
+    pub(super) fn enter_contest(&mut self, passed: Option<Judged>) {
+        self.contest.num_rounds += 1;
+        let Some(Judged { hypothesis, verdict }) = passed else { return };
+        let (round, measured_at) = (self.num_rounds() - 1, self.num_found());
+        let candidate = Candidate { hypothesis, value: verdict.value, round, measured_at };
+        let scene = &self.problem.scene;
+        let same = 2.0 * scene.tolerances.t_he_pr * scene.resolution;
+        let is_same = |other: &&mut Candidate| {
+            let [a, b] = [&candidate, &**other].map(|c| &c.hypothesis.target_from_source);
+            scene.source.displacement(a, b) < same
+        };
+        match self.contest.candidates.iter_mut().find(is_same) {
+            Some(other) if other.value < candidate.value => *other = candidate,
+            Some(_) => {}
+            None => {
+                self.last_passed_at = self.num_rounds();
+                self.contest.candidates.push(candidate);
+            }
+        }
+    }
+
+    /// Ends a contest: of the hypotheses that passed validation, the one with the best value becomes an
+    /// instance and claims its scene points; the others are measured again on what is left, and so on. Those far
+    /// below the best stay for the next contest, in which a better pose of the same instance may turn up. So do all once
+    /// there is no time for it. Returns how many became instances.
+    pub(crate) fn settle(&mut self, stages: &Stages<'_>, grace: &mut Grace<'_>) -> u32 {
+        self.problem.interrupt.begin(Phase::Contest);
+        let start = Instant::now();
+        let mut best_value = None;
+        let mut num_accepted = 0;
+        while stages.params.max_instances.is_none_or(|limit| self.num_found() < limit) {
+            let has_time = grace.allows(self.contest.candidates.len() + 1);
+            if !has_time || !self.measure_candidates(stages, grace) {
+                break;
+            }
+            let least = best_value.map_or(f64::NEG_INFINITY, |value: f64| MARGIN * value);
+            if !self.turn_best(stages, grace) {
+                break;
+            }
+            let Some(value) = self.accept_best(stages.params, least) else { break };
+            best_value = best_value.or(Some(value));
+            num_accepted += 1;
+        }
+        self.contest.num_rounds = 0;
+        self.timings.hv_s += start.elapsed().as_secs_f64();
+        num_accepted
+    }
+
+    /// Validates again the candidates near which an instance has claimed points since they were measured; drops
+    /// those that fail. Whether there was time for all of them.
+    pub(super) fn measure_candidates(&mut self, stages: &Stages<'_>, grace: &mut Grace<'_>) -> bool {
+        let now = self.num_found();
+        let cost = self.problem.cost_of(stages.hv);
+        let mut is_complete = true;
+        let mut candidates = std::mem::take(&mut self.contest.candidates);
+        candidates.retain_mut(|candidate| {
+            let since = &self.instances.poses()[candidate.measured_at as usize..];
+            let pose = &candidate.hypothesis.target_from_source;
+            if since.iter().any(|other| self.problem.are_near(pose, other)) {
+                is_complete = is_complete && grace.allows(cost);
+                if !is_complete {
+                    return true;
+                }
+                let context = self.context(stages.params, candidate.round);
+                let verdict = stages.hv.validate(&context, &candidate.hypothesis);
+                (candidate.value, candidate.measured_at) = (verdict.value, now);
+                return verdict.accepted();
+            }
+            true
+        });
+        self.contest.candidates = candidates;
+        is_complete
+    }
+
+    /// Makes an instance of the best candidate, the earlier of equals, if its value is at least `least`; returns
+    /// the value.
+    pub(super) fn accept_best(&mut self, params: &Params, least: f64) -> Option<f64> {
+        let at = self.contest.best()?;
+        if self.contest.candidates[at].value < least {
+            return None;
+        }
+        let Candidate { hypothesis, value, round, .. } = self.contest.candidates.remove(at);
+        if params.removal == Removal::Inliers {
+            let spent = self.context(params, round).witnesses().spent(&hypothesis.target_from_source);
+            let num_removed = self.problem.remove(&spent);
+            if let Some(last) = self.rounds.last_mut() {
+                last.num_removed += num_removed;
+            }
+        }
+        self.tried = Tried::default();
+        self.ahead.forget();
+        self.instances.push(hypothesis, round);
+        self.last_passed_at = self.num_rounds();
+        Some(value)
+    }
+}

@@ -1,0 +1,53 @@
+//! Trying a pose the other ways round: parts that look alike from several sides are often found turned.
+
+use super::contest::Candidate;
+use super::stages::Stages;
+use super::state::State;
+use crate::detail::Detail;
+use crate::grace::Grace;
+use crate::params::Refine;
+use crate::stages::Hypothesis;
+
+/// How many of the turned poses are looked at closely.
+const NUM_TURNS: usize = 4;
+
+impl State<'_> {
+    /// Turns the best candidate about if it fits better that way ([`Refine::IcpTurns`]). Whether there was time for it.
+    pub(super) fn turn_best(&mut self, stages: &Stages<'_>, grace: &mut Grace<'_>) -> bool {
+        let scene = &self.problem.scene;
+        if stages.params.refine != Refine::IcpTurns || !scene.is_one_sided() {
+            return true;
+        }
+        let Some(at) = self.contest.best() else { return true };
+        let Candidate { hypothesis, value, round, .. } = self.contest.candidates[at];
+        let context = self.context(stages.params, round);
+        let turns = scene.source.turns();
+        let cost = self.problem.cost_of_look();
+        let glances = grace.map(
+            turns.len(),
+            |_| 2 * cost,
+            |i| {
+                let pose = scene.icp(Detail::Glance, &(hypothesis.target_from_source * turns[i]));
+                let claims = context.claims.near(&pose);
+                (scene.fit(Detail::Glance, &pose, |rows| claims.contain(rows)).share, pose)
+            },
+        );
+        let Some(mut glances) = glances.into_iter().collect::<Option<Vec<_>>>() else { return false };
+        glances.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        let mut best = (value, hypothesis);
+        for (_, pose) in &glances[..NUM_TURNS] {
+            if !grace.allows(8 * cost) {
+                return false;
+            }
+            let target_from_source = scene.icp(Detail::Look, pose);
+            let turned = Hypothesis { target_from_source, ..hypothesis };
+            let verdict = stages.hv.validate(&context, &turned);
+            if verdict.value > best.0 {
+                best = (verdict.value, turned);
+            }
+        }
+        let candidate = &mut self.contest.candidates[at];
+        (candidate.value, candidate.hypothesis) = best;
+        true
+    }
+}
