@@ -14,7 +14,8 @@
 //! Then correspondences are removed and the next round begins, until the seeds run dry. [`Registrar`] is the
 //! loop; each stage is a trait in [`stages`] and an enum of named variants in [`Params`].
 //!
-//! Where correspondences are not given, [`features`] makes them from a mesh and a scan.
+//! Where correspondences are not given, [`features`] makes them from a mesh and a scan, and [`detection::Model`] goes all
+//! the way from these to the poses.
 //!
 //! All lengths in [`Params`] are multiples of the resolution `pr`, so the unit of the data does not matter.
 //! The same input and seed give the same bits, for any number of threads.
@@ -24,6 +25,7 @@
 
 mod checks;
 mod detail;
+pub mod detection;
 mod error;
 mod evidence;
 pub mod features;

@@ -31,7 +31,8 @@ pub struct Views {
 
 impl Default for Views {
     fn default() -> Self {
-        Self { count: 64, max_angle_rad: 75.0_f64.to_radians(), lift: None }
+        // 75 degrees.
+        Self { count: 64, max_angle_rad: 1.309, lift: None }
     }
 }
 

@@ -13,6 +13,7 @@ mod conformance;
 mod contest;
 mod default_preset;
 mod dense_graph;
+mod detection;
 mod errors;
 mod evidence;
 mod features;

@@ -1,0 +1,311 @@
+//! The model and a scan: matched, and registered.
+
+use std::time::Instant;
+
+use nalgebra::{Point3, Vector3};
+
+use super::bodies::across;
+use super::doubts::{self, Doubt};
+use super::model::{DIM, Model, describe};
+use super::scan::{Measured, Prepared, Setting, standing};
+use super::{DetectionError, Origin, Run, VOXELS_PER_SPACING, sides};
+use crate::error::Argument;
+use crate::features::{Descriptors, FeatureError, Matches, Matching, match_features};
+use crate::interrupt::Interrupt;
+use crate::kernels::par::Pool;
+use crate::params::Params;
+use crate::registrar::{Observer, Registrar};
+use crate::registration::Registration;
+use crate::scene::Correspondences;
+use crate::scene::{Cloud, check_points};
+use crate::stop::StopReason;
+
+/// Nearest model points that each scene point is joined to: walls and edges repeat on a part.
+const PER_POINT: usize = 4;
+
+/// In larger voxels a part is a few points, which fit everywhere; below the second number that is told.
+const MIN_VOXELS_PER_DIAMETER: f64 = 8.0;
+const FEW_VOXELS_PER_DIAMETER: f64 = 12.0;
+
+/// Points that a pose needs.
+const MIN_POINTS: usize = 3;
+
+/// How a model is looked for in a scan.
+#[derive(Debug, Clone)]
+pub struct Detect {
+    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with a viewpoint, else the default.
+    pub params: Option<Params>,
+    /// Whether the plane with most points is taken away. `None`: where it looks like a table, with less than 2 % of the
+    /// points behind it as the viewpoint sees it.
+    pub remove_plane: Option<bool>,
+    /// Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts is the box around
+    /// all points but the outermost hundredth on each side; fewer than 100 points tell nothing.
+    pub check_units: bool,
+    /// Threads, and how to end it.
+    pub run: Run,
+}
+
+impl Default for Detect {
+    fn default() -> Self {
+        Self { params: None, remove_plane: None, check_units: true, run: Run::default() }
+    }
+}
+
+/// A scan as it was matched with a model.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct MatchedScan {
+    /// The scan, thinned and without its table.
+    pub points: Vec<Point3<f64>>,
+    /// One for each of them, of length 1.
+    pub normals: Vec<Vector3<f64>>,
+    /// [row of the model, row of `points`], and how alike they are.
+    pub matches: Matches,
+    /// What the scan was thinned to, data units: the model's voxel, or more where the scan is coarser.
+    pub voxel: f64,
+    /// What is doubtful about the scan, and about the model.
+    pub doubts: Vec<Doubt>,
+}
+
+/// The instances of a model in a scan.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct Detection {
+    /// The poses. Labels and inliers are rows of the matches of [`Self::scan`].
+    pub registration: Registration,
+    /// What was registered; `None` where time ran out before.
+    pub scan: Option<MatchedScan>,
+    /// Those of the run: with a resolution that the scan can carry, where it is coarser than the model.
+    pub params: Params,
+    /// Of what nothing was found, and in which unit there would be something.
+    of_units: Option<Doubt>,
+}
+
+impl Detection {
+    /// What the result is to be mistrusted for.
+    pub fn doubts(&self) -> impl Iterator<Item = &Doubt> {
+        self.scan.iter().flat_map(|scan| &scan.doubts).chain(&self.of_units)
+    }
+}
+
+impl Model {
+    /// Finds every instance of this model in a scan: [`Self::correspond`], then a [`Registrar`].
+    ///
+    /// Wanted are the viewpoint of the scan or its normals, which then point outwards; and all that was measured
+    /// ([`Cloud::with_measured`]) where the scan is only a part of it. A scan that holds nothing, and one for which there was
+    /// no time, gives an empty result.
+    ///
+    /// # Errors
+    /// If the model has no normals; if neither a viewpoint nor normals are given, or most of them are missing; if the scan
+    /// cannot be in the unit of the model; if a parameter is out of range; else those of [`Registrar::begin`].
+    pub fn detect(&self, scan: &Cloud<'_>, options: &Detect) -> Result<Detection, DetectionError> {
+        self.detect_with(scan, options, |registrar, _| registrar, &mut ())
+    }
+
+    /// [`Self::detect`] with stages of your own, which `set_up` puts in, and an observer that sees every round.
+    ///
+    /// # Errors
+    /// Those of [`Self::detect`].
+    pub fn detect_with(
+        &self,
+        scan: &Cloud<'_>,
+        options: &Detect,
+        set_up: impl FnOnce(Registrar<'static>, &MatchedScan) -> Registrar<'static>,
+        observer: &mut dyn Observer,
+    ) -> Result<Detection, DetectionError> {
+        let start = Instant::now();
+        let mut params = options.params.clone().unwrap_or_else(|| match scan.viewpoint {
+            Some(_) => Params::single_view(),
+            None => Params::default(),
+        });
+        params.validate()?;
+        let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
+        let pool = Pool::new(options.run.num_threads)?;
+        let matched = pool.install(|| self.matched(scan, options, &interrupt));
+        let (matched, measured) = match matched {
+            Ok(matched) => matched,
+            Err(error) if error.is_interrupted() => {
+                let registration = self.nothing(&params, start, &interrupt);
+                return Ok(Detection { registration, scan: None, params, of_units: None });
+            }
+            Err(error) => return Err(error),
+        };
+        if matched.voxel > self.voxel() && params.resolution.is_none() {
+            params.resolution = Some(matched.voxel / VOXELS_PER_SPACING);
+        }
+        let registration = if interrupt.is_set() || matched.matches.rows.is_empty() {
+            self.nothing(&params, start, &interrupt)
+        } else {
+            let spent_s = start.elapsed().as_secs_f64();
+            let timeout_s = params.timeout_s.map(|limit| (limit - spent_s).max(0.0));
+            let mut registrar = Registrar::of(self.source().clone())
+                .params(Params { timeout_s, ..params.clone() })
+                .cancel_token(options.run.cancel.clone());
+            if let Some(num_threads) = options.run.num_threads {
+                registrar = registrar.num_threads(num_threads);
+            }
+            if let Some(watcher) = &options.run.watcher {
+                registrar = registrar.watcher(watcher.clone());
+            }
+            let (target, correspondences) = matched.input(scan, &measured);
+            let registrar = set_up(registrar, &matched);
+            let mut found = registrar.register_observed(&target, &correspondences, observer)?;
+            if let StopReason::Timeout { value, threshold } = &mut found.stop_reason {
+                *value = found.timings.total_s + spent_s;
+                *threshold = params.timeout_s.unwrap_or(*threshold);
+            }
+            found
+        };
+        let is_over = registration.stop_reason.is_from_outside();
+        let of_units = if registration.poses.is_empty() && measured.len() >= doubts::ENOUGH && !is_over {
+            pool.install(|| self.unit_doubt(scan.viewpoint, &measured, &interrupt))?
+        } else {
+            None
+        };
+        Ok(Detection { registration, scan: Some(matched), params, of_units })
+    }
+
+    /// Matches a scan with this model, which needs normals: the first half of [`Self::detect`], on the threads that it is
+    /// called on.
+    ///
+    /// The scan is thinned to [`Self::voxel`], or to what it can carry if it is coarser, its table taken away, its normals
+    /// estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined to the four model points
+    /// most like it. Nothing is matched where the scan holds nothing but a table or stray points.
+    ///
+    /// # Errors
+    /// Those of [`Self::detect`]; or if it is interrupted.
+    pub fn correspond(
+        &self,
+        scan: &Cloud<'_>,
+        options: &Detect,
+        interrupt: &Interrupt,
+    ) -> Result<MatchedScan, DetectionError> {
+        Ok(self.matched(scan, options, interrupt)?.0)
+    }
+
+    /// And the points that were measured.
+    fn matched(
+        &self,
+        scan: &Cloud<'_>,
+        options: &Detect,
+        interrupt: &Interrupt,
+    ) -> Result<(MatchedScan, Vec<Point3<f64>>), DetectionError> {
+        let normals = self.normals().ok_or(DetectionError::NoNormals)?;
+        let viewpoint = scan.viewpoint;
+        if viewpoint.is_none() && scan.normals.is_none() {
+            return Err(DetectionError::NoSide);
+        }
+        let measured = Measured::of(&scan.points, scan.normals.as_deref())?;
+        check_points(&measured.points, Argument::Tgt)?;
+        if scan.normals.is_some() && measured.normals.is_none() {
+            let (num_missing, len) = (measured.num_without_normal, measured.points.len());
+            return Err(DetectionError::MostNormalsMissing { num_missing, len });
+        }
+        let diameter = self.diameter(interrupt)?;
+        if options.check_units {
+            doubts::check_units(diameter, &measured.points)?;
+        }
+        let setting =
+            Setting { voxel: self.voxel(), diameter, viewpoint, remove_plane: options.remove_plane };
+        let prepared = Prepared::new(&measured, &setting, interrupt)?;
+        let holds_nothing =
+            prepared.points.len() < MIN_POINTS || across(&prepared.points) <= self.source().spacing;
+        let is_known = prepared.voxel <= self.voxel().max(diameter / MIN_VOXELS_PER_DIAMETER);
+
+        let matches = if holds_nothing || !is_known {
+            Matches::default()
+        } else {
+            let described = self.described(normals, prepared.voxel, interrupt)?;
+            let of_scan = describe(&prepared.points, &prepared.normals, prepared.voxel, interrupt)?;
+            let [model, scan] = [&described.values, &of_scan].map(|values| Descriptors { values, dim: DIM });
+            let matching = Matching { k: PER_POINT, ..Matching::default() };
+            let mut matches = match_features(model, scan, matching, interrupt)?;
+            if let Some(rows) = &described.rows {
+                matches.rows.iter_mut().for_each(|pair| pair[0] = rows[pair[0] as usize]);
+            }
+            matches
+        };
+
+        let mut doubts = Vec::new();
+        let (num_dropped, num_points) = (measured.num_dropped, measured.points.len());
+        if num_dropped > 0 {
+            doubts.push(Doubt::NotFinite { num_dropped, num_given: num_dropped + num_points });
+        }
+        let voxel = prepared.voxel;
+        if num_points < MIN_POINTS {
+            doubts.push(Doubt::FewPoints { num_points });
+        } else if holds_nothing {
+            doubts.push(Doubt::Nothing);
+        } else if !is_known {
+            doubts.push(Doubt::TooCoarse { voxel, diameter });
+        } else if voxel > self.voxel() {
+            if let Origin::Mesh { voxel: given, is_given: true } = self.origin() {
+                doubts.push(Doubt::CoarserThanGiven { given, voxel });
+            }
+            if voxel * FEW_VOXELS_PER_DIAMETER > diameter {
+                doubts.push(Doubt::Coarse { voxel, diameter });
+            }
+        }
+        if let Some(eye) = &viewpoint {
+            let is_behind = prepared.is_behind_table.then_some(Doubt::BehindPlane);
+            doubts.extend(is_behind.or_else(|| doubts::of_viewpoint(eye, &prepared)));
+        }
+        doubts.extend(self.normals_doubt(normals, interrupt)?);
+
+        let Prepared { points, normals, .. } = prepared;
+        Ok((MatchedScan { points, normals, matches, voxel, doubts }, measured.points))
+    }
+
+    /// Whether the normals of a cloud point inwards; those of a mesh were turned.
+    fn normals_doubt(
+        &self,
+        normals: &[Vector3<f64>],
+        interrupt: &Interrupt,
+    ) -> Result<Option<Doubt>, DetectionError> {
+        if self.origin() != Origin::Cloud {
+            return Ok(None);
+        }
+        let share = if let Some(&known) = self.inward.get() {
+            known
+        } else {
+            let share = sides::inward(self.points(), normals, self.source().spacing, interrupt);
+            let share = share.ok_or(FeatureError::Interrupted)?;
+            *self.inward.get_or_init(|| share)
+        };
+        Ok((share > doubts::MAX_INWARD).then_some(Doubt::NormalsInward { share }))
+    }
+
+    /// Whether another unit would explain that nothing is found; not told once time has run out.
+    fn unit_doubt(
+        &self,
+        viewpoint: Option<Point3<f64>>,
+        measured: &[Point3<f64>],
+        interrupt: &Interrupt,
+    ) -> Result<Option<Doubt>, DetectionError> {
+        let told = || {
+            let diameter = self.diameter(interrupt)?;
+            Ok(doubts::of_units(diameter, &standing(measured, viewpoint, interrupt)?))
+        };
+        told().or_else(|error: DetectionError| if error.is_interrupted() { Ok(None) } else { Err(error) })
+    }
+
+    /// What a scan gives that holds nothing to register, or for which there was no time.
+    fn nothing(&self, params: &Params, start: Instant, interrupt: &Interrupt) -> Registration {
+        let few = StopReason::FewCorrespondences { value: 0, threshold: MIN_POINTS as u32 };
+        let reason = interrupt.check().break_value().unwrap_or(few);
+        Registration::empty(0, reason, start, params.resolution.unwrap_or(self.source().spacing))
+    }
+}
+
+impl MatchedScan {
+    /// What a registrar takes. `scan` is as it was given, `measured` what of it is finite.
+    fn input<'a>(&'a self, scan: &'a Cloud<'_>, measured: &'a [Point3<f64>]) -> (Cloud<'a>, Correspondences) {
+        let mut target = Cloud::new(&self.points).with_normals(self.normals.clone());
+        if let Some(viewpoint) = scan.viewpoint {
+            target =
+                target.with_viewpoint(viewpoint).with_measured(scan.measured.as_deref().unwrap_or(measured));
+        }
+        let rows = self.matches.rows.iter().map(|pair| pair.map(|row| row as usize)).collect();
+        (target, Correspondences::from_rows(rows).with_similarity(self.matches.similarity.clone()))
+    }
+}
