@@ -29,7 +29,7 @@ import numpy.typing as npt
 from ibi_rs import io
 from ibi_rs._core import InputError, ParamsError
 from ibi_rs._inputs import Points, _count, _num_threads
-from ibi_rs._register import Model
+from ibi_rs._model import Model
 from ibi_rs.params import Params
 from ibi_rs.registration import Registration, Round
 
