@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -343,17 +344,12 @@ class Model:
             params = Params() if viewpoint is None else Params.single_view()
         params = _limited(params, max_instances, timeout_s)
         scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
-        own = None
-        if params._own():
-
-            def own(points: _Floats, corr: npt.NDArray[np.int64]) -> dict[str, Callable[..., Any]]:
-                return own_stages(params._own(), params.seed, self._points, points, corr)
-
+        own = params._own()
         raw = _core.detect(
             self._core,
             params=params._json,
             on_round=None if callback is None else on_round(callback),
-            own=own,
+            own=partial(own_stages, own, params.seed, self._points) if own else None,
             **scan,
         )
         if raw["resolution_set"] != params.resolution:
