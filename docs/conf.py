@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import ibi_rs
 from sphinx.application import Sphinx
 from sphinx.util import logging
+
+sys.path.insert(0, str(Path(__file__).parent))
+from variants import shown
 
 project = "ibi_rs"
 author = "the ibi_rs contributors"
@@ -59,17 +63,11 @@ def check_presets(app: Sphinx) -> None:
         written[name] = cells
     values = [_plain_values(params) for params in PRESETS.values()]
     names = {name for preset in values for name in preset}
-    real = {name: [_shown(preset[name]) if name in preset else "–" for preset in values] for name in names}
+    real = {name: [shown(preset[name]) if name in preset else "–" for preset in values] for name in names}
     for name in sorted(names | written.keys()):
         if written.get(name) != real.get(name):
             text = "parameters.md, preset table: %s is %s in the package and %s on the page"
             logging.getLogger(__name__).warning(text, name, real.get(name), written.get(name))
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    return "none" if value is None else str(value).lower()
 
 
 def list_references(_app: Sphinx, _what: str, _name: str, _obj: Any, _options: Any, lines: list[str]) -> None:

@@ -836,7 +836,7 @@ def test_rotation_vectors_are_scipys():
     rotations = Rotation.random(200, random_state=0)
     half = Rotation.from_rotvec(np.pi * np.eye(3))
     for rotation in [*rotations, *half, Rotation.identity()]:
-        ours = Rotation.from_rotvec(cli.common._rotation_vector(rotation.as_matrix()))
+        ours = Rotation.from_rotvec(cli.outputs._rotation_vector(rotation.as_matrix()))
         assert (ours * rotation.inv()).magnitude() < 1e-7
 
 

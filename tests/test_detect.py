@@ -59,6 +59,39 @@ def test_detect_is_correspond_and_register(tee):
     np.testing.assert_array_equal(tee.detect(scan, viewpoint=CAMERA), by_hand)
 
 
+def test_a_stage_of_ones_own_sees_what_is_registered(tee):
+    _, scan, _ = example("tee6")
+    matches = tee.correspond(scan, viewpoint=CAMERA)
+    seen = []
+
+    def nothing(context, dense):
+        seen.append((context.tgt_points, context.src, context.tgt))
+
+    params = ibi.Params.single_view().replace(te=nothing, max_rounds=2)
+    found = tee.detect(scan, params, viewpoint=CAMERA)
+    assert (len(found), found.stop_reason.name, found.params) == (0, "max_rounds", params)
+    assert len(seen) == 2
+    for points, src, tgt in seen:
+        np.testing.assert_array_equal(points, matches.tgt)
+        np.testing.assert_array_equal(src, tee.points[matches.corr[:, 0]])
+        np.testing.assert_array_equal(tgt, matches.tgt[matches.corr[:, 1]])
+
+    def broken(context, dense):
+        raise KeyError("broken")
+
+    with pytest.raises(KeyError, match="broken"):
+        tee.detect(scan, params.replace(te=broken), viewpoint=CAMERA)
+
+
+def test_a_callback_sees_the_rounds_and_may_end_them(tee):
+    _, scan, _ = example("tee6")
+    rounds = []
+    found = tee.detect(scan, viewpoint=CAMERA, callback=lambda one: rounds.append(one) or len(rounds) < 3)
+    assert (found.rounds, found.stop_reason.name) == (tuple(rounds), "cancelled")
+    with pytest.raises(TypeError, match="callback must be callable"):
+        tee.detect(scan, viewpoint=CAMERA, callback=3)
+
+
 def test_threads_and_pickling_change_nothing(tee):
     _, scan, _ = example("tee6")
     found = tee.detect(scan, viewpoint=CAMERA, num_threads=2)

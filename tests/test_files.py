@@ -20,8 +20,8 @@ def recording(path):
 
 
 WRITERS = {
-    "poses.json": lambda path: cli.common.write_json(path, {"poses": []}),
-    "poses.csv": lambda path: cli.common.write_bop(path, [(0, 0, np.asarray(FOUND), [1.0, 1.0], 0.1)]),
+    "poses.json": lambda path: cli.outputs.write_json(path, {"poses": []}),
+    "poses.csv": lambda path: cli.outputs.write_bop(path, [(0, 0, np.asarray(FOUND), [1.0, 1.0], 0.1)]),
     "found.png": lambda path: ibi.plot.instances(SCENE.tgt, SCENE.src, FOUND, path),
     "found.pdf": lambda path: ibi.plot.instances(SCENE.tgt, SCENE.src, FOUND, path),
     "found.rrd": recording,

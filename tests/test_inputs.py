@@ -7,8 +7,8 @@ from typing import get_args
 import ibi_rs as ibi
 import numpy as np
 import pytest
-from ibi_rs._core import features_nearest_rows
-from ibi_rs._inputs import _scan
+from ibi_rs._core import measured_rows
+from ibi_rs._inputs import _scan_rows
 from ibi_rs.variants import Ce, Scs, Te
 
 SCENE = ibi.synth.outlier_layout(
@@ -503,10 +503,18 @@ ORGANISED |= {
 }
 
 
+BALL = ibi.Model(SRC, normals=SRC)
+
+
+def scan(points, normals):
+    of_points = None if normals is None else _scan_rows("tgt_normals", normals)
+    return measured_rows(_scan_rows("tgt", points), of_points)
+
+
 @pytest.mark.parametrize("form", ORGANISED.values(), ids=ORGANISED)
 def test_organised_scans_are_taken_in_any_form(form):
     holed = put(put(IMAGE, (0, 1, 2), NAN), (3, 3), INF)
-    points, normals, num_dropped = _scan("tgt", form(holed), form(UP))
+    points, normals, num_dropped, _ = scan(form(holed), form(UP))
     assert points.tolist() == np.delete(IMAGE.reshape(-1, 3), [1, 18], axis=0).tolist()
     assert (normals.tolist(), num_dropped) == ([[0, 0, 2]] * 18, 2)
 
@@ -519,7 +527,7 @@ def test_a_normal_that_is_missing_is_that_of_the_nearest_point(missing):
     normals[7] = [0, 1, 0]
     points = np.arange(20.0)[:, None] ** 2 * [1.0, 0, 0]
     points[6] = [48, 0, 0]
-    held, of_points, num_dropped = _scan("tgt", points, normals)
+    held, of_points, num_dropped, _ = scan(points, normals)
     assert (held.tolist(), num_dropped) == (points.tolist(), 0)
     assert of_points[[4, 6]].tolist() == [[1, 0, 0], [0, 1, 0]]
     assert np.array_equal(normals[4], missing, equal_nan=True)  # those of the caller are as they were
@@ -527,7 +535,7 @@ def test_a_normal_that_is_missing_is_that_of_the_nearest_point(missing):
     with pytest.raises(
         ibi.InputError, match="tgt_normals: 11 of 20 are 0 or not finite; leave tgt_normals out"
     ):
-        _scan("tgt", points, normals)
+        BALL.detect(points, tgt_normals=normals)
 
 
 @pytest.mark.parametrize(
@@ -541,16 +549,23 @@ def test_a_normal_that_is_missing_is_that_of_the_nearest_point(missing):
 )
 def test_what_is_no_scan_is_refused(points, normals, pattern):
     with pytest.raises(ibi.InputError, match="^" + pattern):
-        _scan("tgt", points, normals)
+        scan(points, normals)
 
 
-@pytest.mark.parametrize("num_points", [1, 2, 100, 6000])
+@pytest.mark.parametrize("num_points", [2, 100, 6000])
 @pytest.mark.parametrize("stretch", [(1, 1, 1), (0, 5, 0), (0, 0, 0), (1e-3, 1, 9)])
-def test_the_nearest_points_are_the_nearest(num_points, stretch):
+def test_the_nearest_point_lends_its_normal(num_points, stretch):
     rng = np.random.default_rng(num_points)
     points = rng.normal(size=(num_points, 3)) * stretch + 1000
-    queries = rng.normal(size=(4007, 3)) * (2 * np.array(stretch) + 0.1) + 1000
-    found = np.linalg.norm(points[features_nearest_rows(points, queries)] - queries, axis=1)
-    for block in np.array_split(np.arange(len(queries)), 30):
-        least = np.linalg.norm(points[None] - queries[block, None], axis=2).min(axis=1)
-        np.testing.assert_allclose(found[block], least, rtol=1e-5)
+    normals = np.column_stack([1 + np.arange(num_points), np.ones((num_points, 2))])  # each another one
+    without = rng.permutation(num_points)[: num_points // 2]
+    normals[without] = 0
+    _, completed, _, num_missing = measured_rows(points, normals)
+    assert num_missing == len(without)
+    lenders = completed[without, 0].astype(int) - 1
+    assert np.isin(lenders, without, invert=True).all()
+    has = np.setdiff1d(np.arange(num_points), without)
+    for block in np.array_split(np.arange(len(without)), 30):
+        least = np.linalg.norm(points[has][None] - points[without[block], None], axis=2).min(axis=1)
+        found = np.linalg.norm(points[lenders[block]] - points[without[block]], axis=1)
+        np.testing.assert_allclose(found, least, rtol=1e-5)

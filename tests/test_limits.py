@@ -1,6 +1,5 @@
 """Limits outside of the rounds: time counts from the call, and Ctrl-C is heard wherever a call takes long."""
 
-import pickle
 import signal
 import threading
 import time
@@ -8,7 +7,7 @@ import time
 import ibi_rs as ibi
 import numpy as np
 import pytest
-from ibi_rs import _clock, _core, features, metrics
+from ibi_rs import _core, features, metrics
 
 WATCHDOG_S = 30
 
@@ -41,18 +40,6 @@ def scan(part):
     return np.concatenate([part.points, part.points + np.array([4.0, 3.0, 0.0]), table])
 
 
-def counted(monkeypatch, most):
-    """Let no time be left from the ask after so many on; returns what counts the asks."""
-    asks = []
-
-    def left_s(clock):
-        asks.append(clock)
-        return clock.timeout_s if len(asks) <= most else 0.0
-
-    monkeypatch.setattr(_clock.Clock, "left_s", property(left_s))
-    return asks
-
-
 def check_out_of_time(found, params):
     assert (len(found), found.rounds) == (0, ())
     assert (found.labels == -1).all()
@@ -63,22 +50,6 @@ def check_out_of_time(found, params):
     assert min(reason.value, found.timings.total_s) > 0
     assert found.resolution >= 0
     assert repr(found).startswith("Registration: 0 instances in 0 rounds")
-
-
-def test_time_runs_out_in_each_step_before_the_rounds(monkeypatch, part, scan):
-    params = ibi.Params.single_view().replace(timeout_s=1e6, max_rounds=3)
-    fresh = pickle.dumps(part)  # without what it keeps for the next scene
-    with monkeypatch.context() as patched:
-        asks = counted(patched, 1000)
-        found = pickle.loads(fresh).detect(scan, params, viewpoint=[3, 3, 20])
-        assert found.stop_reason.name != "timeout"
-        assert found.params == params
-    # Thinning, plane, normals, two clouds described, matching; and the rounds have the rest.
-    assert len(asks) >= 7
-    for most in range(len(asks)):
-        with monkeypatch.context() as patched:
-            counted(patched, most)
-            check_out_of_time(pickle.loads(fresh).detect(scan, params, viewpoint=[3, 3, 20]), params)
 
 
 def test_no_time_at_all(part, scan):
@@ -100,12 +71,6 @@ def test_the_rounds_have_what_is_left(part, scan):
     assert found.stop_reason.name == "timeout"
     assert found.stop_reason.threshold == timeout_s <= found.stop_reason.value
     assert found.params.timeout_s == timeout_s
-
-
-def test_a_limit_counts_for_detect_alone(part, scan):
-    with pytest.raises(TimeoutError), _clock.Clock(0.0):
-        features.voxel_downsample(scan, 0.1)
-    assert len(features.voxel_downsample(scan, 0.1)[0]) > 0
 
 
 def test_what_is_wrong_is_said_before_time_runs_out(part, scan):

@@ -3,7 +3,10 @@
 import copy
 import json
 import pickle
+import re
+import sys
 from dataclasses import FrozenInstanceError, asdict, fields
+from pathlib import Path
 from typing import get_args
 
 import ibi_rs as ibi
@@ -81,6 +84,72 @@ def test_defaults_are_those_of_the_core():
 def test_defaults_of_each_variant_are_those_of_the_core(stage, variant):
     core = json.loads(_core.check_params(json.dumps({stage: {"variant": variant.variant}})))
     assert {"variant": variant.variant, **asdict(variant())} == core[stage]
+
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "docs"))
+import variants as written  # noqa: E402
+
+PARAMETERS = list(written.parameters())
+
+
+def core_docs():
+    """What the core's source says of each field of each variant."""
+    for path in (ROOT / "crates/ibi-core/src/stages").rglob("*.rs"):
+        for name, body in re.findall(
+            r"^pub struct (\w+) \{\n(.*?)^\}", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            for doc, field in re.findall(r"((?:    ///.*\n)+)(?:    (?:#|//) ?.*\n)*    pub (\w+):", body):
+                yield (name, field), " ".join(doc.replace("///", "").split())
+
+
+def plain(text):
+    """Without markup."""
+    return text.replace("`", "")
+
+
+def test_what_a_parameter_means_is_said_in_the_core_first():
+    said = dict(core_docs())
+    names = {variant.variant: variant.__name__.rstrip("_") for _, variant in EACH_VARIANT}
+    for path, variant, _, meaning in PARAMETERS:
+        core = plain(said[names[variant], path.partition(".")[2]])
+        assert plain(meaning).startswith(core), f"{path} of {variant}"
+
+
+def test_the_page_has_the_parameters_of_the_variants():
+    assert written.page() == written.PAGE.read_text(encoding="utf-8"), "run docs/variants.py"
+
+
+def ends(meaning):
+    """Values within a range, as it is written, and values without."""
+    number = r"(\d[\d,]*)"
+    if found := re.search(rf"\b{number} to {number}\b", meaning):
+        low, high = (int(text.replace(",", "")) for text in found.groups())
+        return (low, high), (low - 1, high + 1)
+    if found := re.search(rf"\bAt least {number}\b", meaning):
+        return (int(found[1]),), (int(found[1]) - 1,)
+    if ">= 0" in meaning:
+        return (0, 1e9), (-1e-6, 1e10)
+    if "> 0" in meaning:
+        return (1e-9, 1e9), (0, -1, 1e10)
+    return (), ()
+
+
+@pytest.mark.parametrize("parameter", PARAMETERS, ids=lambda p: f"{p.variant}-{p.path}")
+def test_a_range_is_what_the_core_takes(parameter):
+    path, variant, default, meaning = parameter
+    stage, _, name = path.partition(".")
+    within, without = ends(meaning)
+    assert within or isinstance(default, (bool, str))
+
+    def check(value):
+        _core.check_params(json.dumps({stage: {"variant": variant, name: value}}))
+
+    for value in within:
+        check(value)
+    for value in without:
+        with pytest.raises(ibi.ParamsError):
+            check(value)
 
 
 def test_the_core_knows_no_further_variant():

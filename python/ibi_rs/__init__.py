@@ -4,12 +4,14 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 """
 
 from ibi_rs import features, io, metrics, plot, stages, synth, viz
-from ibi_rs._batch import Job, JobError, register_batch
+from ibi_rs._batch import register_batch
 from ibi_rs._core import InputError, ParamsError, __version__
-from ibi_rs._detect import Matches
+from ibi_rs._job import Job, JobError
 from ibi_rs._match import match
+from ibi_rs._matches import Matches
+from ibi_rs._model import Model
 from ibi_rs._ray import RayExecutor
-from ibi_rs._register import Model, register
+from ibi_rs._register import register
 from ibi_rs._view import View
 from ibi_rs.params import Params
 from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict

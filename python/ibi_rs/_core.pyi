@@ -8,19 +8,21 @@ import numpy.typing as npt
 
 __all__ = [
     "InputError",
+    "Model",
     "ParamsError",
-    "Source",
     "Symmetries",
     "__version__",
     "check_params",
+    "correspond",
+    "detect",
     "features_dominant_plane",
     "features_estimate_normals",
     "features_fpfh",
     "features_match",
-    "features_nearest_rows",
     "features_outer_surface",
     "features_sample_mesh",
     "features_voxel_downsample",
+    "measured_rows",
     "metrics_add",
     "metrics_add_s",
     "metrics_assignment",
@@ -61,8 +63,8 @@ def params_from_toml(text: str) -> str: ...
 # Registration.
 
 @final
-class Source:
-    """A source that was checked and prepared."""
+class Model:
+    """A model that was checked and prepared; ``mesh_voxel``: that of a mesh, and whether it was given."""
 
     def __new__(
         cls,
@@ -70,13 +72,29 @@ class Source:
         normals: _Floats | None = None,
         frames: _Floats | None = None,
         symmetries: Symmetries | None = None,
-    ) -> Source: ...
+        mesh_voxel: tuple[float, bool] | None = None,
+    ) -> Model: ...
+    @staticmethod
+    def from_mesh(
+        vertices: _Floats,
+        faces: _Ints,
+        voxel: float | None,
+        symmetries: Symmetries | None,  # None: they are looked for
+        num_threads: int | None,
+    ) -> Model: ...
     @property
     def spacing(self) -> float: ...
-    def diameter(self, num_threads: int | None, timeout_s: float | None = None) -> float: ...
+    @property
+    def voxel(self) -> float: ...
+    @property
+    def mesh_voxel(self) -> tuple[float, bool] | None: ...
+    def points(self) -> _Floats: ...
+    def normals(self) -> _Floats | None: ...
+    def symmetries(self) -> Symmetries: ...
+    def diameter(self, num_threads: int | None) -> float: ...
 
 def register(
-    source: Source,
+    model: Model,
     tgt: _Floats,
     corr: npt.NDArray[Any],  # (M, 2) int64 or (M, 6) float64
     params: str,
@@ -88,16 +106,46 @@ def register(
     measured: _Floats | None = None,
     num_threads: int | None = None,
     on_round: Callable[[str], object] | None = None,
-    scs: Callable[..., object] | None = None,
-    ce: Callable[..., object] | None = None,
-    te: Callable[..., object] | None = None,
-    hv: Callable[..., object] | None = None,
+    own: dict[str, Callable[..., object]] | None = None,  # stages, by their names
 ) -> dict[str, Any]:
     """Arrays, one entry per pose: target_from_source (K, 4, 4), score, overlap, inlier_rmse, inliers, round.
 
     Then of the run: labels (M,) int32, resolution and stop_message; and as JSON text rounds, stop_reason and
     timings.
     """
+
+# Detection.
+
+def measured_rows(
+    points: _Floats, normals: _Floats | None = None
+) -> tuple[_Floats, _Floats | None, int, int]:
+    """Rows that are finite, and normals, completed or None; how many rows went, how many had no normal."""
+
+def correspond(
+    model: Model,
+    tgt: _Floats,
+    tgt_normals: _Floats | None,
+    viewpoint: Sequence[float] | None,
+    remove_plane: bool | None,
+    check_units: bool,
+    num_threads: int | None,
+) -> tuple[_Floats, _Floats, _Ints, _Floats, float, list[str]]:
+    """Points, normals, [row of the model, row of the points], similarity, voxel, warnings."""
+
+def detect(
+    model: Model,
+    tgt: _Floats,
+    params: str,
+    tgt_normals: _Floats | None,
+    viewpoint: Sequence[float] | None,
+    measured: _Floats | None,
+    remove_plane: bool | None,
+    check_units: bool,
+    num_threads: int | None,
+    on_round: Callable[[str], object] | None,
+    own: Callable[[_Floats, _Ints], dict[str, Callable[..., object]]] | None,
+) -> dict[str, Any]:
+    """As `register`; and ``warnings``, and ``resolution_set``, that of the parameters."""
 
 # Symmetries.
 
@@ -116,15 +164,11 @@ def symmetries_find(points: _Floats, normals: _Floats | None, tolerance: float) 
 
 # Features.
 
-# With `timeout_s`, counted from the call, a TimeoutError says that time has run out.
-
-def features_nearest_rows(points: _Floats, queries: _Floats) -> _Ints: ...
 def features_voxel_downsample(
     points: _Floats,
     normals: _Floats | None,
     voxel: float,
     num_threads: int | None,
-    timeout_s: float | None = None,
 ) -> tuple[_Floats, _Floats | None]: ...
 def features_estimate_normals(
     points: _Floats,
@@ -132,7 +176,6 @@ def features_estimate_normals(
     max_neighbors: int,
     viewpoint: Sequence[float] | None,
     num_threads: int | None,
-    timeout_s: float | None = None,
 ) -> _Floats: ...
 def features_fpfh(
     points: _Floats,
@@ -141,7 +184,6 @@ def features_fpfh(
     max_neighbors: int,
     keypoints: _Ints | None,
     num_threads: int | None,
-    timeout_s: float | None = None,
 ) -> npt.NDArray[np.float32]: ...
 def features_match(
     src_feat: npt.NDArray[np.float32],
@@ -150,7 +192,6 @@ def features_match(
     mutual: bool,
     ratio: float | None,
     num_threads: int | None,
-    timeout_s: float | None = None,
 ) -> tuple[_Ints, _Floats]: ...
 def features_dominant_plane(
     points: _Floats,
@@ -159,7 +200,6 @@ def features_dominant_plane(
     viewpoint: Sequence[float] | None,
     seed: int,
     num_threads: int | None,
-    timeout_s: float | None = None,
 ) -> tuple[list[float], float, npt.NDArray[np.bool_], float] | None: ...
 def features_sample_mesh(
     vertices: _Floats, faces: _Ints, count: int | None, spacing: float, seed: int

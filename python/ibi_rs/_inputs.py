@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs._core import InputError, features_nearest_rows
+from ibi_rs._core import InputError
 
 Points = Any
 """(N, 3) real numbers, or an object with ``.points``, ``.vertices``, ``__array__`` or ``__dlpack__``."""
@@ -38,6 +38,22 @@ def _real(name: str, value: Any) -> npt.NDArray[Any]:
     return array
 
 
+def _shaped(name: str, value: Any, *shape: int | str) -> npt.NDArray[Any]:
+    """Real numbers in this shape, in which a letter stands for any number; of an empty list for none."""
+    array = _real(name, value)
+    if array.shape == (0,) and isinstance(shape[0], str) and all(isinstance(side, int) for side in shape[1:]):
+        return array.reshape(0, *shape[1:])
+    sides = zip(array.shape, shape, strict=False)
+    if array.ndim != len(shape) or any(isinstance(want, int) and side != want for side, want in sides):
+        words = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+        raise InputError(f"{name} has shape {array.shape}; it must be ({words})")
+    return array
+
+
+def _floats(name: str, value: Any, *shape: int | str) -> npt.NDArray[np.float64]:
+    return _aligned(_shaped(name, value, *shape), np.float64)
+
+
 def _aligned(array: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
     """Copy what the core cannot read in place: it takes a field of a packed record for something else."""
     with np.errstate(over="ignore"):  # of longdouble; the core refuses infinity
@@ -46,10 +62,7 @@ def _aligned(array: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
 
 def _points(name: str, value: Any) -> npt.NDArray[np.float64]:
     """(N, 3) float64, from an array or from an object that holds one."""
-    array = _held(name, value)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3)")
-    return _aligned(array, np.float64)
+    return _floats(name, _held(name, value), "N", 3)
 
 
 def _held(name: str, value: Any) -> npt.NDArray[Any]:
@@ -63,43 +76,6 @@ def _held(name: str, value: Any) -> npt.NDArray[Any]:
     return array.reshape(0, 3) if array.shape == (0,) else array
 
 
-_FARTHEST = 1e150
-"""Squares of distances end there."""
-
-
-def _scan_points(name: str, value: Any) -> tuple[npt.NDArray[np.float64], int]:
-    """(N, 3) float64 of a scan, organised or not, without rows that are not finite; and how many went."""
-    points, _, num_dropped = _scan(name, value, None)
-    return points, num_dropped
-
-
-def _scan(
-    name: str, points: Any, normals: Any
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64] | None, int]:
-    """Points and normals of a scan, as `_scan_points`; who has no normal gets that of its nearest point."""
-    held = _scan_rows(name, points)
-    of_points = None if normals is None else _scan_rows(f"{name}_normals", normals)
-    if of_points is not None and len(of_points) != len(held):
-        raise InputError(
-            f"{name}_normals has {len(of_points)} rows; it must have one for each of the {len(held)} rows of"
-            f" {name}"
-        )
-    beyond = held[np.isfinite(held) & (np.abs(held) > _FARTHEST)]
-    if len(beyond):
-        raise InputError(f"{name} has a coordinate of {beyond[0]:g}; {_FARTHEST:g} is the largest allowed")
-    finite = np.isfinite(held).all(axis=1)
-    num_dropped = len(held) - int(finite.sum())
-    if num_dropped:
-        held, of_points = held[finite], None if of_points is None else of_points[finite]
-    if of_points is not None:
-        of_points, num_missing = _completed(held, of_points)
-        if of_points is None:
-            raise InputError(
-                f"{name}_normals: {num_missing} of {len(held)} are 0 or not finite; leave {name}_normals out"
-            )
-    return held, of_points, num_dropped
-
-
 def _scan_rows(name: str, value: Any) -> npt.NDArray[np.float64]:
     """(N, 3) float64 of what is (N, 3) or (H, W, 3)."""
     array = _held(name, value)
@@ -110,37 +86,13 @@ def _scan_rows(name: str, value: Any) -> npt.NDArray[np.float64]:
     return _aligned(array, np.float64)
 
 
-_MOST_WITHOUT_NORMAL = 0.5
-"""Where more of the points have none, those of the others tell nothing about them."""
-
-
-def _completed(
-    points: npt.NDArray[np.float64], normals: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64] | None, int]:
-    """Give a point without a normal that of its nearest one, unless most have none; and how many had none.
-
-    Estimators write 0 or NaN where they know none.
-    """
-    is_missing = ~(np.isfinite(normals).all(axis=1) & normals.any(axis=1))
-    num_missing = int(np.count_nonzero(is_missing))
-    if num_missing == 0:
-        return normals, 0
-    if num_missing > _MOST_WITHOUT_NORMAL * len(normals):
-        return None, num_missing
-    normals = normals.copy()
-    normals[is_missing] = normals[~is_missing][features_nearest_rows(points[~is_missing], points[is_missing])]
-    return normals, num_missing
-
-
 RIGID_TOLERANCE = 1e-6
 """How far from a rotation a matrix may be, per entry of R^T R: single precision passes, a scale does not."""
 
 
 def _rigid(name: str, value: Any) -> npt.NDArray[np.float64]:
     """(4, 4), a rotation and a translation."""
-    motion = np.asarray(_real(name, value), dtype=np.float64)
-    if motion.shape != (4, 4):
-        raise InputError(f"{name} has shape {motion.shape}; it must be (4, 4)")
+    motion = _floats(name, value, 4, 4)
     if not np.isfinite(motion).all():
         raise InputError(f"{name} has a value that is not finite")
     turn = motion[:3, :3]
@@ -173,24 +125,16 @@ def _mesh(vertices: Any, faces: Any) -> tuple[npt.NDArray[np.float64], npt.NDArr
 
 
 def _frames(name: str, value: Any) -> npt.NDArray[np.float64]:
-    array = _real(name, value)
-    if array.ndim != 3 or array.shape[1:] != (3, 3):
-        raise InputError(f"{name} has shape {array.shape}; it must be (N, 3, 3)")
-    return _aligned(array, np.float64)
+    return _floats(name, value, "N", 3, 3)
 
 
 def _vector(name: str, value: Any) -> npt.NDArray[np.float64]:
-    array = _real(name, value)
-    if array.ndim != 1:
-        raise InputError(f"{name} has shape {array.shape}; it must be (M,)")
-    return _aligned(array, np.float64)
+    return _floats(name, value, "M")
 
 
 def _viewpoint(value: Any) -> list[float]:
-    array = _real("viewpoint", value)
-    if array.shape != (3,):
-        raise InputError(f"viewpoint has shape {array.shape}; it must be (3,)")
-    return [float(x) for x in array]
+    eye: list[float] = _floats("viewpoint", value, 3).tolist()
+    return eye
 
 
 def _correspondences(value: Any) -> npt.NDArray[Any]:
@@ -268,25 +212,15 @@ def _seed(value: Any) -> int:
 
 
 def _rows(name: str, value: Any) -> npt.NDArray[np.int64]:
-    array = _real(name, value)
-    if array.shape == (0,):
-        return np.empty(0, np.int64)
-    if array.ndim != 1:
-        raise InputError(f"{name} has shape {array.shape}; it must be (K,)")
-    return _indices(name, array)
+    return _indices(name, _shaped(name, value, "K"))
 
 
 def _faces(value: Any) -> npt.NDArray[np.int64]:
-    array = _real("faces", value)
-    if array.shape == (0,):
-        return np.empty((0, 3), np.int64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"faces has shape {array.shape}; it must be (F, 3)")
-    return _indices("faces", array)
+    return _indices("faces", _shaped("faces", value, "F", 3))
 
 
 def _indices(name: str, array: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    if not np.issubdtype(array.dtype, np.integer):
+    if array.size and not np.issubdtype(array.dtype, np.integer):  # what is empty has no type of its own
         raise TypeError(f"{name} has dtype {array.dtype}; rows must be integers")
     return _int64(array)
 

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._clock import _left_s
-from ibi_rs._inputs import _aligned, _count, _num_threads, _number, _real
+from ibi_rs._inputs import _aligned, _count, _num_threads, _number, _shaped
 
 
 def match(
@@ -85,12 +84,11 @@ def match(
         bool(mutual),
         None if ratio is None else _number("ratio", ratio),
         _num_threads(num_threads),
-        _left_s(),
     )
 
 
 def _descriptors(name: str, value: Any) -> npt.NDArray[np.float32]:
-    array = _real(name, value)
-    if array.ndim != 2 or array.shape[1] == 0:
-        raise _core.InputError(f"{name} has shape {array.shape}; it must be (N, D) with D at least 1")
+    array = _shaped(name, value, "N", "D")
+    if array.shape[1] == 0:
+        raise _core.InputError(f"{name} has shape {array.shape}; D must be at least 1")
     return _aligned(array, np.float32)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._inputs import _frozen, _number, _real, _rigid, _scan_points, _viewpoint
+from ibi_rs._inputs import _floats, _frozen, _number, _rigid, _scan_rows, _viewpoint
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,9 +44,9 @@ class View:
         place = np.array(_viewpoint(eye))
         if not np.isfinite(place).all():
             raise _core.InputError(f"viewpoint is {place.tolist()}; it must be finite")
-        held, num_dropped = _scan_points("viewpoint.points", points)
+        held, _, num_dropped, _ = _core.measured_rows(_scan_rows("viewpoint.points", points))
         object.__setattr__(self, "eye", _frozen(place))
-        object.__setattr__(self, "points", _frozen(held.copy()))
+        object.__setattr__(self, "points", _frozen(held))
         object.__setattr__(self, "num_dropped", num_dropped)
 
     @classmethod
@@ -85,9 +85,7 @@ class View:
         TypeError
             An argument is of another type than above.
         """
-        image = np.asarray(_real("depth", depth), dtype=np.float64)
-        if image.ndim != 2:
-            raise _core.InputError(f"depth has shape {image.shape}; it must be (H, W)")
+        image = _floats("depth", depth, "H", "W")
         points = depth_points(image, *_intrinsics(fx, fy, cx, cy))
         if len(points) == 0:
             raise _core.InputError("depth: no pixel has one")

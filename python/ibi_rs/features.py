@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._clock import _left_s
 from ibi_rs._inputs import (
     Points,
     _count,
@@ -88,7 +87,6 @@ def voxel_downsample(
         _optional("normals", normals),
         _number("voxel", voxel),
         _num_threads(None),
-        _left_s(),
     )
 
 
@@ -155,7 +153,6 @@ def estimate_normals(
         _count("max_neighbors", max_neighbors, 3),
         None if viewpoint is None else _viewpoint(viewpoint),
         _num_threads(num_threads),
-        _left_s(),
     )
 
 
@@ -226,7 +223,6 @@ def fpfh(
         _count("max_neighbors", max_neighbors, 2),
         None if keypoints is None else _rows("keypoints", keypoints),
         _num_threads(num_threads),
-        _left_s(),
     )
 
 
@@ -321,7 +317,6 @@ def dominant_plane(
         None if viewpoint is None else _viewpoint(viewpoint),
         _seed(seed),
         _num_threads(num_threads),
-        _left_s(),
     )
     if found is None:
         return None

@@ -259,6 +259,16 @@ class Params:
         return _dumps(self._built_in())
 
 
+def _limited(params: Params | None, max_instances: int | None, timeout_s: float | None) -> Params:
+    """Return the parameters of a run."""
+    params = Params() if params is None else params
+    if not isinstance(params, Params):
+        raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
+    overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
+    overrides = {name: value for name, value in overrides.items() if value is not None}
+    return params.replace(**overrides) if overrides else params
+
+
 def _is_own(stage: Any) -> bool:
     """Whether it can be called for a stage; a class is more likely a variant without its brackets."""
     return callable(stage) and not isinstance(stage, type)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, overload
 
@@ -172,6 +172,18 @@ class Round:
         return cls(**{**data, "verdict": verdict and Verdict(**verdict)})
 
 
+def on_round(callback: Callable[[Round], object]) -> Callable[[str], bool]:
+    """Bring a round from the core to the user, and back whether to go on: unless the answer is False."""
+    if not callable(callback):
+        raise TypeError(f"callback must be callable, not {type(callback).__name__}")
+
+    def told(text: str) -> bool:
+        answer = callback(Round._from_dict(json.loads(text)))
+        return bool(answer) if isinstance(answer, (bool, np.bool_)) else True
+
+    return told
+
+
 @dataclass(frozen=True)
 class StopReason:
     """Why a run ended.
@@ -263,6 +275,21 @@ class Registration(Sequence[Pose]):
         self.resolution = resolution
         self.params = params
         self.warnings = tuple(warnings)
+
+    @classmethod
+    def _of(cls, raw: dict[str, Any], params: Params) -> Registration:
+        """Dress what the core gives."""
+        columns = [raw[field.name] for field in fields(Pose)]
+        return cls(
+            list(map(Pose, *columns)),
+            labels=raw["labels"],
+            rounds=raw["rounds"],
+            stop_reason=StopReason(message=raw["stop_message"], **json.loads(raw["stop_reason"])),
+            timings=Timings(**json.loads(raw["timings"])),
+            resolution=raw["resolution"],
+            params=params,
+            warnings=raw.get("warnings", ()),
+        )
 
     @cached_property
     def rounds(self) -> tuple[Round, ...]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ibi_rs import _core
 from ibi_rs._core import InputError
 from ibi_rs._files import read_json
-from ibi_rs._inputs import Points, _aligned, _frozen, _number, _optional, _points, _real
+from ibi_rs._inputs import Points, _aligned, _floats, _frozen, _number, _optional, _points, _real
 
 __all__ = ["Axis", "Symmetries", "find_symmetries"]
 
@@ -323,10 +323,7 @@ def find_symmetries(
 
 def _motions(name: str, value: npt.ArrayLike) -> _Floats:
     """(S, 4, 4) of exact rotations, from what may be rounded."""
-    array = _real(name, value) if np.size(value) else np.empty((0, 4, 4))
-    if array.ndim != 3 or array.shape[1:] != (4, 4):
-        raise InputError(f"{name} has shape {array.shape}; it must be (S, 4, 4)")
-    motions = np.array(array, dtype=np.float64)
+    motions = np.array(_floats(name, value, "S", 4, 4))
     for row, motion in enumerate(motions):
         rotation = motion[:3, :3]
         if not np.isfinite(motion).all():
@@ -351,10 +348,7 @@ def _axis(name: str, given: Any) -> tuple[_Floats, _Floats]:
 
 
 def _pose(name: str, value: Any) -> _Floats:
-    array = _real(name, getattr(value, "target_from_source", value))
-    if array.shape != (4, 4):
-        raise InputError(f"{name} has shape {array.shape}; it must be (4, 4)")
-    return _aligned(array, np.float64)
+    return _floats(name, getattr(value, "target_from_source", value), 4, 4)
 
 
 def _listed(entry: dict[str, Any], name: str) -> list[Any]:

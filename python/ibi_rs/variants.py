@@ -1,6 +1,8 @@
 """The variants of the four stages, as their parameters: frozen dataclasses.
 
-Defaults and ranges are the Rust core's; :class:`ibi_rs.Params` takes one for each stage and checks it.
+Defaults and ranges are the Rust core's; :class:`ibi_rs.Params` takes one for each stage and checks it. What a
+parameter means begins as at its field there, and ``docs/parameters.md`` has it from here: tests hold the
+three together.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ class Gtm:
     Parameters
     ----------
     n_downsample
-        N_downsample: correspondences that play, drawn anew each round; 3 to 16384. Memory: 4 n^2 bytes.
+        N_downsample: correspondences that play, drawn anew each round. 3 to 16384. Memory: 4 n^2 bytes.
     n_gtm
-        N_gtm: generations of the replicator; at least 1.
+        N_gtm: generations of the replicator. At least 1.
     payoff
-        What two correspondences gain from each other: ``"gaussian"``, exp(-r^2 / delta_r^2), or ``"ratio"``,
+        What two correspondences gain from each other. ``"gaussian"``: exp(-r^2 / delta_r^2); ``"ratio"``:
         min(a/b, b/a), with a, b the distances of their source and target points and r = abs(a - b).
 
     References
@@ -45,23 +47,23 @@ class LocalGtm:
     Parameters
     ----------
     tau_pr
-        Largest rigidity of compatible correspondences, in pr; > 0.
+        tau: largest rigidity of compatible correspondences, in pr. > 0.
     min_length_pr
-        Correspondences nearer to each other than this, on either side, say nothing about a pose, in pr; >= 0.
+        Correspondences nearer to each other than this, on either side, say nothing about a pose, in pr. >= 0.
     normal_tolerance
-        With normals: how far the angles between two oriented points may differ, in cosine; > 0.
+        With normals: how far the angles between two oriented points may differ, in cosine. > 0.
     second_order
         Whether an edge is weighed by what its two ends have in common, or by its own rigidity alone.
     max_degree
         Where correspondences have more compatible ones than this around them, only so many of them take part
-        that they have about as many; at least 8. Bounds time and memory, and keeps those down that are
-        compatible with all and sundry.
+        that they have about as many. Bounds time and memory, and keeps those down that are compatible with
+        all and sundry. At least 8.
     first_look
         Where more correspondences than this lie around one, a first graph holds only so many of them, which
         is enough to find most instances in a fraction of the time. Once nothing more comes of it, a graph of
         all that are left takes its place. None: that one from the beginning. At least 8.
     n_gtm
-        N_gtm: generations of the replicator; at least 1.
+        N_gtm: generations of the replicator. At least 1.
 
     References
     ----------
@@ -89,7 +91,7 @@ class Nnsr:
     Parameters
     ----------
     n_nnsr
-        Seeds of a round; at least 3.
+        Seeds of a round. At least 3.
 
     References
     ----------
@@ -110,9 +112,9 @@ class Hough3d:
     Parameters
     ----------
     bin_pr
-        Width of a cell of the accumulator, in pr; > 0.
+        Width of a cell of the accumulator, in pr. > 0.
     frame_radius_pr
-        Radius of the neighbourhood that a frame is computed from, in pr; > 0. Unused where frames are given.
+        Radius of the neighbourhood that a frame is computed from, in pr. > 0. Unused where frames are given.
 
     References
     ----------
@@ -133,8 +135,8 @@ class Voting:
     Parameters
     ----------
     n_vot
-        N_vot: the correspondences with the most votes that go on; at least 3. With removal ``"dense"`` each
-        round takes them out, so it should be about as many as one instance has.
+        N_vot: size of C_d. At least 3. With removal ``"dense"`` each round takes the correspondences with the
+        most votes out, so it should be about as many as one instance has.
 
     References
     ----------
@@ -159,9 +161,10 @@ class Gsac:
     Parameters
     ----------
     n_gsac
-        N_gsac: triplets tried; 1 to 1,000,000.
+        N_gsac: triplets tried. 1 to 1,000,000.
     min_height_pr
-        Triplets whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
+        Triplets whose points are within this distance of one line, on either side, are skipped and counted,
+        in pr. >= 0. Noise of one pr turns a thinner triangle by tens of degrees.
 
     References
     ----------
@@ -180,7 +183,7 @@ class Irls:
     Parameters
     ----------
     n_refits
-        Fits after the first, to the alive correspondences within 2, 2, 1, 1, ... ``t_he``; 1 to 1000.
+        Fits after the first. 1 to 1000. To the alive correspondences within 2, 2, 1, 1, ... ``t_he``.
     """
 
     variant: ClassVar[str] = "irls"
@@ -194,9 +197,10 @@ class Ransac:
     Parameters
     ----------
     n_ransac
-        Triplets drawn; 1 to 10,000,000.
+        Triplets drawn. 1 to 10,000,000.
     min_height_pr
-        Triplets whose points are this near to one line, on either side, are skipped and counted, in pr; >= 0.
+        Triplets whose points are within this distance of one line, on either side, are skipped and counted,
+        in pr. >= 0.
 
     References
     ----------
@@ -218,16 +222,16 @@ class SacCot:
     Parameters
     ----------
     n_sac_cot
-        Triangles tried, those with the largest sum of compatibilities; 1 to 1,000,000.
+        Triangles tried. 1 to 1,000,000. Those with the largest sum of compatibilities.
     d_cmp_pr
-        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr; > 0.
+        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr. > 0.
     t_cmp
-        t_cmp: least compatibility of an edge; 0 to 1.
+        t_cmp: least compatibility of an edge. 0 to 1.
     max_triangles
         Triangles looked at, at most; a round that has come so far is ``capped``. 1 to 1,000,000,000.
     min_height_pr
-        Triangles whose points are this near to one line, on either side, are skipped and counted, in pr;
-        >= 0.
+        Triangles whose points are within this distance of one line, on either side, are skipped and counted,
+        in pr. >= 0.
 
     References
     ----------
@@ -253,14 +257,15 @@ class Mac:
     Parameters
     ----------
     d_cmp_pr
-        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr; > 0.
+        d_cmp: two correspondences are compatible by exp(-r^2 / d_cmp^2), in pr. > 0.
     t_cmp
-        t_cmp: least compatibility of an edge of the first order; 0 to 1.
+        t_cmp: least compatibility of an edge of the first order. 0 to 1.
     t_sog
-        Least weight of an edge of the second order, as a share of the largest; 0 to 1.
-    max_cliques, max_steps
-        Maximal cliques and steps of the search, at most; a round that has come so far is ``capped``. 1 to
-        1,000,000,000 each.
+        Least weight of an edge of the second order, as a share of the largest. 0 to 1.
+    max_cliques
+        Maximal cliques looked at, at most; a round that has come so far is ``capped``. 1 to 1,000,000,000.
+    max_steps
+        Steps of the search, at most; a round that has come so far is ``capped``. 1 to 1,000,000,000.
 
     References
     ----------
@@ -282,9 +287,9 @@ class Overlap:
     Parameters
     ----------
     t_overlap
-        The share to exceed, 0 to 1. Of all source points, or where normals count, are oriented and there is
-        a viewpoint, of those that can be seen from it. Without it a depth camera sees at most about half of
-        an object: for scenes from one view 0.3 to 0.4.
+        t_overlap: the share to exceed. 0 to 1. Of all source points, or where normals count, are oriented and
+        there is a viewpoint, of those that can be seen from it. Without it a depth camera sees at most about
+        half of an object: for scenes from one view 0.3 to 0.4.
     exclusive
         Whether target points that an accepted instance explains support no later one, so that an instance is
         found once.
@@ -312,7 +317,7 @@ class Evidence:
     Parameters
     ----------
     t_score
-        The probability to exceed, 0 to 1.
+        The probability to exceed. 0 to 1.
     t_sure
         A pose that is right with a probability of more than this becomes an instance at once; the others wait
         for the end of the contest. 0 to 1; 1: all wait.
@@ -334,7 +339,7 @@ class InlierCount:
     Parameters
     ----------
     t_inliers
-        The count to exceed; at least 1. The paper tries 50, 100 and 150.
+        The count to exceed; the paper tries 50, 100 and 150. At least 1.
     """
 
     variant: ClassVar[str] = "inlier_count"

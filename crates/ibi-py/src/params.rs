@@ -3,7 +3,7 @@
 use ibi_core::Params;
 use pyo3::prelude::*;
 
-use crate::{ParamsError, to_py_err};
+use crate::error::{OrPyErr, ParamsError};
 
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(preset, m)?)?;
@@ -15,7 +15,7 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
 /// Params from JSON, checked.
 pub(crate) fn parse(json: &str) -> PyResult<Params> {
     let params: Params = serde_json::from_str(json).map_err(invalid)?;
-    params.validate().map_err(|e| to_py_err(&e))?;
+    params.validate().or_py_err()?;
     Ok(params)
 }
 
@@ -68,7 +68,7 @@ fn nulls_to_none(value: &mut serde_json::Value) {
 #[pyfunction]
 fn params_from_toml(text: &str) -> PyResult<String> {
     let params: Params = toml::from_str(&with_blocks(text)).map_err(invalid)?;
-    params.validate().map_err(|e| to_py_err(&e))?;
+    params.validate().or_py_err()?;
     to_json(&params)
 }
 

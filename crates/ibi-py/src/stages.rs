@@ -3,24 +3,41 @@
 //! `ibi_rs.stages` stands between: it makes the view that the callable gets, and checks shapes, ids and numbers of what
 //! comes back. Whether a matrix is a rigid motion is checked here.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
+use ibi_core::Registrar;
 use ibi_core::nalgebra::Isometry3;
 use ibi_core::stages::{
     Context, Enhance, Estimate, EstimatePose, Hypothesis, Ranked, SelectSeeds, Validate, Verdict,
 };
-use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1};
 use pyo3::prelude::*;
 
-use crate::InputError;
-use crate::metrics::rigid_motion;
-use crate::register::Caller;
+use crate::background::Caller;
+use crate::convert::{Pose, entries, matrices, pose};
 
 /// A callable in the place of a stage. Where it fails the run is cancelled, and what the stage answers then is thrown
 /// away.
-pub(crate) struct Own {
+struct Own {
     callable: Arc<Py<PyAny>>,
     caller: Caller,
+}
+
+/// The callables of the user's, by the names of the stages that they stand for.
+pub(crate) type OwnStages = HashMap<String, Py<PyAny>>;
+
+pub(crate) fn put_in<'a>(registrar: Registrar<'a>, own: OwnStages, caller: &Caller) -> Registrar<'a> {
+    own.into_iter().fold(registrar, |registrar, (stage, callable)| {
+        let own = Own { callable: Arc::new(callable), caller: caller.clone() };
+        match stage.as_str() {
+            "scs" => registrar.with_scs(own),
+            "ce" => registrar.with_ce(own),
+            "te" => registrar.with_te(own),
+            "hv" => registrar.with_hv(own),
+            _ => registrar,
+        }
+    })
 }
 
 /// What the stage before has come to.
@@ -31,10 +48,6 @@ enum Given {
 }
 
 impl Own {
-    pub(crate) fn new(callable: Py<PyAny>, caller: Caller) -> Self {
-        Self { callable: Arc::new(callable), caller }
-    }
-
     /// Calls with (round, resolution, alive, barred, poses) and what is given.
     fn ask<T: Send + 'static>(
         &self,
@@ -47,10 +60,9 @@ impl Own {
         let alive: Vec<i64> = context.alive.ids().iter().copied().map(i64::from).collect();
         let barred: Vec<i64> =
             (0_i64..).zip(context.barred).filter(|&(_, &barred)| barred).map(|(id, _)| id).collect();
-        let poses: Vec<f64> = context.claims.poses().flat_map(entries).collect();
+        let poses: Vec<Isometry3<f64>> = context.claims.poses().copied().collect();
         self.caller.call(move |py| {
-            let num_poses = poses.len() / 16;
-            let poses = poses.into_pyarray(py).reshape([num_poses, 4, 4])?;
+            let poses = matrices(py, poses.iter())?;
             let view = (round, resolution, alive.into_pyarray(py), barred.into_pyarray(py), poses);
             let callable = callable.bind(py);
             let answer = match given {
@@ -104,12 +116,6 @@ impl Validate for Own {
     }
 }
 
-/// Row by row, as numpy has them.
-fn entries(pose: &Isometry3<f64>) -> impl Iterator<Item = f64> + use<> {
-    let columns = pose.to_homogeneous();
-    (0..16).map(move |i| columns[(i / 4, i % 4)])
-}
-
 fn ranked(answer: &Bound<'_, PyAny>) -> PyResult<Ranked> {
     let (ids, scores): (PyReadonlyArray1<'_, i64>, PyReadonlyArray1<'_, f32>) = answer.extract()?;
     let ids = ids.as_array();
@@ -121,10 +127,6 @@ type ScoredPose = Option<(Isometry3<f64>, Option<f64>)>;
 
 /// From None, or from what the pose is called in errors, its matrix, and its score or None.
 fn scored_pose(answer: &Bound<'_, PyAny>) -> PyResult<ScoredPose> {
-    let answer: Option<(String, PyReadonlyArray2<'_, f64>, Option<f64>)> = answer.extract()?;
-    let read = |(name, matrix, score): (String, PyReadonlyArray2<'_, f64>, Option<f64>)| {
-        let pose = rigid_motion(&matrix.as_array(), || name.clone()).map_err(InputError::new_err)?;
-        Ok((pose, score))
-    };
-    answer.map(read).transpose()
+    let answer: Option<(String, Pose<'_>, Option<f64>)> = answer.extract()?;
+    answer.map(|(name, matrix, score)| Ok((pose(&name, &matrix)?, score))).transpose()
 }

@@ -3,14 +3,14 @@
 // pyo3 hands arguments over by value; a read-only array is a handle, cheap to own.
 #![expect(clippy::needless_pass_by_value)]
 
-use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
-use ibi_core::{Axis, FindSymmetries, SymmetryError, Turning, find_symmetries};
-use numpy::{IntoPyArray, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2};
+use ibi_core::nalgebra::{Point3, Vector3};
+use ibi_core::{Axis, FindSymmetries, Turning, find_symmetries};
+use numpy::{PyArray2, PyArray3};
 use pyo3::prelude::*;
 
-use crate::InputError;
-use crate::metrics::{Pose, Poses, pose, poses};
-use crate::register::{in_pool, rows3};
+use crate::background::in_pool;
+use crate::convert::{Pose, Poses, Rows, matrices, pose, poses, rows3, vectors};
+use crate::error::OrPyErr;
 
 /// Adds the contents of this file to the module.
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -26,16 +26,12 @@ pub(crate) struct Symmetries(pub(crate) ibi_core::Symmetries);
 impl Symmetries {
     /// Motions (S, 4, 4), and axes and points of them, (A, 3) each.
     #[new]
-    fn new(
-        discrete: Poses<'_>,
-        axes: PyReadonlyArray2<'_, f64>,
-        offsets: PyReadonlyArray2<'_, f64>,
-    ) -> PyResult<Self> {
+    fn new(discrete: Poses<'_>, axes: Rows<'_>, offsets: Rows<'_>) -> PyResult<Self> {
         let discrete = poses("discrete", &discrete)?;
         let (axes, offsets) = (rows3(&axes, Vector3::new)?, rows3(&offsets, Point3::new)?);
         let axis = |(direction, point)| Axis { direction, point };
         let continuous: Vec<Axis> = axes.into_iter().zip(offsets).map(axis).collect();
-        Ok(Self(ibi_core::Symmetries::new(&discrete, &continuous).map_err(to_py)?))
+        Ok(Self(ibi_core::Symmetries::new(&discrete, &continuous).or_py_err()?))
     }
 
     /// The motions, the identity first; the axes, and a point of each.
@@ -45,12 +41,9 @@ impl Symmetries {
         py: Python<'py>,
     ) -> PyResult<(Bound<'py, PyArray3<f64>>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
         let continuous = self.0.continuous();
-        let rows = |of: fn(&Axis) -> Vector3<f64>| {
-            let flat: Vec<f64> = continuous.iter().flat_map(|axis| <[f64; 3]>::from(of(axis))).collect();
-            flat.into_pyarray(py).reshape([continuous.len(), 3])
-        };
-        let discrete = matrices(py, self.0.discrete())?;
-        Ok((discrete, rows(|axis| axis.direction)?, rows(|axis| axis.point.coords)?))
+        let axes = vectors(py, continuous.iter().map(|axis| axis.direction.into()))?;
+        let offsets = vectors(py, continuous.iter().map(|axis| axis.point.into()))?;
+        Ok((matrices(py, self.0.discrete().iter())?, axes, offsets))
     }
 
     /// Whether all rotations about a point are among them.
@@ -68,38 +61,25 @@ impl Symmetries {
     ) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let (poses, reference) = (self::poses("pose", &poses)?, pose("reference", &reference)?);
         let nearest: Vec<_> = poses.iter().map(|pose| self.0.nearest(pose, &reference)).collect();
-        matrices(py, &nearest)
+        matrices(py, nearest.iter())
     }
 
     fn discretised<'py>(&self, py: Python<'py>, max_step: f64) -> PyResult<Bound<'py, PyArray3<f64>>> {
-        matrices(py, &self.0.discretised(max_step).map_err(to_py)?)
+        matrices(py, self.0.discretised(max_step).or_py_err()?.iter())
     }
 }
 
 #[pyfunction]
 fn symmetries_find(
     py: Python<'_>,
-    points: PyReadonlyArray2<'_, f64>,
-    normals: Option<PyReadonlyArray2<'_, f64>>,
+    points: Rows<'_>,
+    normals: Option<Rows<'_>>,
     tolerance: f64,
 ) -> PyResult<Symmetries> {
     let points = rows3(&points, Point3::new)?;
     let normals = normals.map(|normals| rows3(&normals, Vector3::new)).transpose()?;
     let found = in_pool(py, Some(1), |interrupt| {
-        find_symmetries(&points, normals.as_deref(), FindSymmetries { tolerance }, interrupt).map_err(to_py)
+        find_symmetries(&points, normals.as_deref(), FindSymmetries { tolerance }, interrupt)
     })?;
     Ok(Symmetries(found))
-}
-
-/// nalgebra stores columns, numpy rows.
-fn matrices<'py>(py: Python<'py>, motions: &[Isometry3<f64>]) -> PyResult<Bound<'py, PyArray3<f64>>> {
-    let flat: Vec<f64> = motions
-        .iter()
-        .flat_map(|m| m.to_homogeneous().transpose().iter().copied().collect::<Vec<_>>())
-        .collect();
-    flat.into_pyarray(py).reshape([motions.len(), 4, 4])
-}
-
-fn to_py(error: SymmetryError) -> PyErr {
-    InputError::new_err(error.to_string())
 }

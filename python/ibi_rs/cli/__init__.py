@@ -1,6 +1,6 @@
 """The command `ibi`. Needs typer, rich and the readers: ``pip install 'ibi_rs[cli]'``."""
 
-from .common import FOUND_NOTHING, INTERRUPTED, TERMINATED, app
+from .terminal import FOUND_NOTHING, INTERRUPTED, TERMINATED, app
 
 # Each adds itself to `app`, and stands in the help, in this order.
 from . import register, batch, evaluate, bench  # isort: skip

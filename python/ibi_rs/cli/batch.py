@@ -20,8 +20,15 @@ import ibi_rs as ibi
 from ibi_rs import io
 from ibi_rs._files import read_json, try_writing
 
-from .common import (
-    MAX_THREADS,
+from .outputs import (
+    as_dict,
+    print_table,
+    sha256,
+    try_outputs,
+    write_bop,
+    write_json,
+)
+from .search import (
     FromAllSides,
     MaxInstances,
     ModelFile,
@@ -33,19 +40,16 @@ from .common import (
     TimeoutS,
     Viewpoint,
     Voxel,
-    as_dict,
     chosen_params,
+)
+from .terminal import (
+    MAX_THREADS,
     command,
     err,
     misused,
     out,
-    print_table,
     say,
-    sha256,
-    try_outputs,
     warn,
-    write_bop,
-    write_json,
 )
 
 

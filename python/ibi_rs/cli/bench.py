@@ -17,7 +17,8 @@ from rich.table import Table
 import ibi_rs as ibi
 from ibi_rs import _batch, io
 
-from .common import (
+from .outputs import print_table, try_outputs, write_json
+from .search import (
     FromAllSides,
     MaxInstances,
     ParamsFile,
@@ -28,14 +29,8 @@ from .common import (
     Viewpoint,
     Voxel,
     chosen_params,
-    command,
-    err,
-    misused,
-    out,
-    print_table,
-    try_outputs,
-    write_json,
 )
+from .terminal import command, err, misused, out
 
 
 @command()

@@ -12,7 +12,8 @@ import ibi_rs as ibi
 from ibi_rs import io, metrics
 from ibi_rs._files import read_json, read_npy
 
-from .common import SYMMETRIES, command, misused, out, symmetries_of
+from .search import SYMMETRIES, symmetries_of
+from .terminal import command, misused, out
 
 
 @command("eval")

@@ -13,9 +13,15 @@ import ibi_rs as ibi
 from ibi_rs import io
 from ibi_rs._files import read_npy
 
-from .common import (
-    FOUND_NOTHING,
-    MAX_THREADS,
+from .outputs import (
+    as_dict,
+    sha256,
+    show,
+    try_outputs,
+    write_bop,
+    write_json,
+)
+from .search import (
     FromAllSides,
     MaxInstances,
     ModelFile,
@@ -28,19 +34,17 @@ from .common import (
     TimeoutS,
     Viewpoint,
     Voxel,
-    as_dict,
     chosen_params,
+    symmetries_of,
+)
+from .terminal import (
+    FOUND_NOTHING,
+    MAX_THREADS,
     command,
     err,
     misused,
     out,
-    sha256,
-    show,
-    symmetries_of,
-    try_outputs,
     warn,
-    write_bop,
-    write_json,
 )
 
 

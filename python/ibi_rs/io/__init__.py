@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs._core import InputError
-from ibi_rs._inputs import _completed, _number
+from ibi_rs._core import InputError, measured_rows
+from ibi_rs._inputs import _number
 from ibi_rs._view import _intrinsics, depth_points
 
 from . import _arrays, _clouds, _columns, _meshes, _ply
@@ -169,16 +169,11 @@ def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:
     points = np.asarray(rows.points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{path}: its points are of shape {points.shape}, not (N, 3)")
-    finite = np.isfinite(points).all(axis=1)
-    normals = rows.normals
-    if normals is not None:
-        normals = np.ascontiguousarray(normals[finite], dtype=np.float64)
-    points = np.ascontiguousarray(points[finite])
+    normals = None if rows.normals is None else np.ascontiguousarray(rows.normals, dtype=np.float64)
+    points, normals, num_dropped, _ = measured_rows(np.ascontiguousarray(points), normals)
     if len(points) == 0:
         raise InputError(f"{path}: no points")
-    if normals is not None:
-        normals = _completed(points, normals)[0]
-    return Scan(points, normals, rows.viewpoint, int((~finite).sum()))
+    return Scan(points, normals, rows.viewpoint, num_dropped)
 
 
 def read_depth(

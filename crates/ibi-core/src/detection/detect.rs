@@ -138,15 +138,8 @@ impl Model {
         } else {
             let spent_s = start.elapsed().as_secs_f64();
             let timeout_s = params.timeout_s.map(|limit| (limit - spent_s).max(0.0));
-            let mut registrar = Registrar::of(self.source().clone())
-                .params(Params { timeout_s, ..params.clone() })
-                .cancel_token(options.run.cancel.clone());
-            if let Some(num_threads) = options.run.num_threads {
-                registrar = registrar.num_threads(num_threads);
-            }
-            if let Some(watcher) = &options.run.watcher {
-                registrar = registrar.watcher(watcher.clone());
-            }
+            let limited = Params { timeout_s, ..params.clone() };
+            let registrar = options.run.registrar(Registrar::of(self.source().clone()).params(limited));
             let (target, correspondences) = matched.input(scan, &measured);
             let registrar = set_up(registrar, &matched);
             let mut found = registrar.register_observed(&target, &correspondences, observer)?;

@@ -29,6 +29,7 @@ pub use scan::Measured;
 pub use surface::{FromMesh, MeshSymmetries};
 
 use crate::interrupt::{CancelToken, Interrupt, Watcher};
+use crate::registrar::Registrar;
 
 /// Points that were thinned to a voxel are so much nearer than a voxel, on average.
 const VOXELS_PER_SPACING: f64 = 1.25;
@@ -45,6 +46,19 @@ pub struct Run {
 }
 
 impl Run {
+    /// A registrar that is run, and ended, so.
+    #[must_use]
+    pub fn registrar<'a>(&self, registrar: Registrar<'a>) -> Registrar<'a> {
+        let mut registrar = registrar.cancel_token(self.cancel.clone());
+        if let Some(num_threads) = self.num_threads {
+            registrar = registrar.num_threads(num_threads);
+        }
+        match &self.watcher {
+            Some(watcher) => registrar.watcher(watcher.clone()),
+            None => registrar,
+        }
+    }
+
     fn interrupt(&self) -> Interrupt {
         let interrupt = Interrupt::from(self.cancel.clone());
         match &self.watcher {

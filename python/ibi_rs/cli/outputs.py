@@ -1,0 +1,151 @@
+"""What the commands print and write."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.measure import Measurement
+from rich.table import Table
+
+import ibi_rs as ibi
+from ibi_rs._files import try_writing, written
+from ibi_rs._numbers import lengths
+
+from .terminal import Printer, misused, out
+
+
+def try_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path | None]) -> None:
+    """See before a run that what it finds can be written, and costs no other file.
+
+    Parameters
+    ----------
+    outputs, inputs
+        Files, by what the command line calls them.
+    """
+    taken = {os.path.realpath(path): name for name, path in inputs.items() if path is not None}
+    for name, path in outputs.items():
+        if path is None:
+            continue
+        if name == "--plot":
+            ibi.plot._format(path)
+        if name == "--rerun":
+            ibi.viz._rerun()
+        try_writing(path)
+        if path.exists() and not path.is_file():
+            continue  # of /dev/null there is no end
+        other = taken.setdefault(os.path.realpath(path), name)
+        if other != name:
+            misused(f"{name} {path}: that is {other}; give another name")
+
+
+def show(found: ibi.Registration, seconds: float) -> None:
+    """Print a table of the poses."""
+    table = Table(box=None, pad_edge=False)
+    for column in ("", "score", "overlap", "inliers", "x", "y", "z", "rx", "ry", "rz"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for number, pose in enumerate(found):
+        place = lengths(pose.target_from_source[:3, 3], found.resolution)
+        turn = [f"{x:.1f}" for x in np.degrees(_rotation_vector(pose.target_from_source[:3, :3]))]
+        quality = [f"{pose.score:.2f}", f"{pose.overlap:.2f}", str(pose.num_inliers)]
+        table.add_row(str(number), *quality, *place, *turn)
+    if len(found):
+        print_table(table)
+        out.print("x, y, z in the unit of the scene; rx, ry, rz: rotation vector, degrees", style="dim")
+    out.print(
+        f"{len(found)} found in {seconds:.2f} s; stopped by {found.stop_reason}",
+        highlight=False,
+        markup=False,
+    )
+
+
+def print_table(table: Table) -> None:
+    """Print a table as wide as it has to be: half a number is none, and half a path in a pipe."""
+    needed = Measurement.get(out, out.options.update(width=10_000), table).maximum
+    is_folded = any(column.overflow == "fold" for column in table.columns) and out.is_terminal
+    console = out if is_folded else Printer(emoji=False, width=max(needed, out.width))
+    console.print(table, crop=False)
+
+
+def _rotation_vector(rotation: Any) -> Any:
+    """Axis times angle, by the quaternion: exact for half turns, too."""
+    four = np.empty((4, 4))  # 4 q qT, whose rows are all the quaternion q, (w, x, y, z), times something
+    four[0, 0] = 1 + np.trace(rotation)
+    off = rotation - rotation.T
+    four[0, 1:] = four[1:, 0] = off[2, 1], off[0, 2], off[1, 0]
+    four[1:, 1:] = rotation + rotation.T + (1 - np.trace(rotation)) * np.eye(3)
+    quaternion = four[np.argmax(np.diag(four))]
+    quaternion = quaternion / np.linalg.norm(quaternion) * np.copysign(1, quaternion[0])
+    sine = float(np.linalg.norm(quaternion[1:]))
+    return quaternion[1:] * (2 * np.arctan2(sine, quaternion[0]) / max(sine, 1e-300))
+
+
+def sha256(path: Path) -> str:
+    """Tell a file's content from any other."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def as_dict(
+    found: ibi.Registration,
+    seconds: float,
+    *,
+    model: Path,
+    model_sha256: str,
+    scene: Path,
+    scene_sha256: str,
+    search: dict[str, Any],
+) -> dict[str, Any]:
+    """Bring the poses into the form of the JSON files, with all that they depend on."""
+    return {
+        "ibi_rs": ibi.__version__,
+        "model": str(model),
+        "model_sha256": model_sha256,
+        "scene": str(scene),
+        "scene_sha256": scene_sha256,
+        "search": search,
+        "poses": [
+            {
+                "target_from_source": pose.target_from_source.tolist(),
+                "score": pose.score,
+                "overlap": pose.overlap,
+                "num_inliers": pose.num_inliers,
+                "inlier_rmse": pose.inlier_rmse,
+            }
+            for pose in found
+        ],
+        "warnings": list(found.warnings),
+        "stop_reason": str(found.stop_reason),
+        "seconds": round(seconds, 4),
+        "resolution": found.resolution,
+        "params": found.params.to_dict(),
+    }
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """All of it or nothing, so that what is there after Ctrl-C can be relied on."""
+    with written(path) as part:
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def write_bop(
+    path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], obj_id: int = 1
+) -> None:
+    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds."""
+    with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(["scene_id", "im_id", "obj_id", "score", "R", "t", "time"])
+        for scene_id, im_id, poses, scores, seconds in images:
+            for pose, score in zip(poses, scores, strict=True):
+                parts = pose[:3, :3], 1000 * pose[:3, 3]
+                numbers = (" ".join(f"{x:.9g}" for x in part.ravel()) for part in parts)
+                rows.writerow([scene_id, im_id, obj_id, f"{score:.6f}", *numbers, f"{seconds:.4f}"])

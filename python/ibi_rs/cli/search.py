@@ -1,0 +1,171 @@
+"""The search that the options of a command describe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+import ibi_rs as ibi
+from ibi_rs import io, metrics
+from ibi_rs._inputs import _num_threads
+from ibi_rs.symmetries import _bop_entry as bop_entry
+
+from .terminal import misused
+
+SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has several objects"
+
+PRESETS = {
+    "default": ibi.Params,
+    "single_view": ibi.Params.single_view,
+    "paper_synthetic": ibi.Params.paper_synthetic,
+    "paper_real": ibi.Params.paper_real,
+}
+
+ModelFile = Annotated[
+    Path, typer.Argument(help="Mesh of the part: STL, PLY, OBJ, OFF or GLB.", metavar="MODEL")
+]
+SceneFile = Annotated[
+    Path, typer.Argument(help="Scan: PLY, PCD, LAS, XYZ, CSV, NPY ... in the same unit.", metavar="SCENE")
+]
+Viewpoint = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        help="Where the depth camera stood, in the frame of SCENE: X,Y,Z or three numbers. "
+        "Default: what a PCD file says, else 0,0,0.",
+        metavar="X Y Z",
+    ),
+]
+FromAllSides = Annotated[
+    bool, typer.Option("--from-all-sides", help="SCENE is no depth scan but a whole cloud, with normals.")
+]
+Voxel = Annotated[
+    float | None,
+    typer.Option(
+        help="Spacing of what is looked at. Default: 1/24 of the model, less where that leaves few points."
+    ),
+]
+RemovePlane = Annotated[
+    bool | None,
+    typer.Option(
+        "--remove-plane/--keep-plane",
+        help="Take the largest plane away, or not. Default: if it looks like a table.",
+    ),
+]
+SymmetriesOf = Annotated[
+    str, typer.Option(help=f"{SYMMETRIES}. Of poses that look the same the one turned least is given.")
+]
+Preset = Annotated[str | None, typer.Option(help=f"{', '.join(PRESETS)}; by default what fits the scene.")]
+ParamsFile = Annotated[Path | None, typer.Option(help="Parameters as TOML or JSON.")]
+MaxInstances = Annotated[int | None, typer.Option(min=1, max=2**32 - 1, help="No more than so many.")]
+TimeoutS = Annotated[float | None, typer.Option(help="Seconds, then what was found is kept.")]
+
+
+@dataclass(frozen=True)
+class Search:
+    """How to look for a part in a scan, from the options of the command line."""
+
+    viewpoint: tuple[float, float, float] | None
+    from_all_sides: bool
+    voxel: float | None
+    remove_plane: bool | None
+    params: ibi.Params | None
+    max_instances: int | None
+    timeout_s: float | None
+    symmetries: str = "none"
+
+    def __post_init__(self) -> None:
+        """Refuse now what would be refused once the files are read."""
+        if self.from_all_sides and self.viewpoint is not None:
+            misused("--from-all-sides has no --viewpoint; leave one of them out")
+        if self.viewpoint is not None and not np.isfinite(self.viewpoint).all():
+            misused("--viewpoint must be three finite numbers")
+        if self.voxel is not None and not 0 < self.voxel < np.inf:
+            misused(f"--voxel is {self.voxel:g}; it must be above 0 and finite")
+        if self.timeout_s is not None and not 0 <= self.timeout_s <= 1e9:
+            misused(f"--timeout-s is {self.timeout_s:g}; it must be from 0 to 1e9")
+        _num_threads(None)  # IBI_NUM_THREADS
+
+    def model(self, path: Path, num_threads: int | None) -> ibi.Model:
+        """Read and prepare the part."""
+        mesh = io.read_mesh(path)
+        wanted = None if self.symmetries == "find" else symmetries_of(self.symmetries, mesh[0])
+        return ibi.Model.from_mesh(
+            *mesh, voxel=self.voxel, symmetries=wanted or "find", num_threads=num_threads
+        )
+
+    def sight(self, normals: Any, viewpoint: Any) -> dict[str, Any]:
+        """Those arguments of `Model.correspond` that `Model.detect` has, too, by what a file says."""
+        place = (0.0, 0.0, 0.0) if viewpoint is None else tuple(viewpoint)
+        return {
+            "tgt_normals": normals if self.from_all_sides else None,
+            "viewpoint": None if self.from_all_sides else self.viewpoint or place,
+            "remove_plane": self.remove_plane,
+        }
+
+    def params_for(self, default: ibi.Params | None = None) -> ibi.Params:
+        """Return those that a run will have: the chosen ones, or those that fit the scene, and the limits."""
+        if default is None:
+            default = ibi.Params() if self.from_all_sides else ibi.Params.single_view()
+        limits = {"max_instances": self.max_instances, "timeout_s": self.timeout_s}
+        given = {name: value for name, value in limits.items() if value is not None}
+        return (self.params or default).replace(**given)
+
+    def recorded(self, symmetries: ibi.Symmetries) -> dict[str, Any]:
+        """Return what a result depends on beside the parameters and the files, for the JSON."""
+        return {
+            "viewpoint": None if self.viewpoint is None else list(self.viewpoint),
+            "from_all_sides": self.from_all_sides,
+            "voxel": self.voxel,
+            "remove_plane": self.remove_plane,
+            "symmetries": symmetries.to_bop(),
+        }
+
+    def limits(self, num_threads: int | None) -> dict[str, Any]:
+        """Return what ends a run, and its threads."""
+        return {
+            "max_instances": self.max_instances,
+            "timeout_s": self.timeout_s,
+            "num_threads": num_threads,
+        }
+
+
+def symmetries_of(given: str, points: Any, normals: Any = None) -> ibi.Symmetries:
+    """Read, find or leave out the symmetries of a model."""
+    if given in ("find", "none"):
+        return ibi.find_symmetries(points, normals) if given == "find" else ibi.Symmetries.none()
+    path, _, number = given.rpartition(":")
+    path, obj_id = (path, int(number)) if path and number.isdecimal() else (given, None)
+    # BOP's lengths are in mm; what the model's are is seen by its diameter.
+    entry, scale = bop_entry(path, obj_id), 1.0
+    if "diameter" in entry:
+        declared, own = entry["diameter"], metrics.diameter(points)
+        is_number = isinstance(declared, (int, float)) and not isinstance(declared, bool)
+        if not is_number or not 0 < declared < np.inf:
+            raise ibi.InputError(f"{path}: diameter is {declared!r}; it must be a length in mm, above 0")
+        if own == 0:
+            raise ibi.InputError("the model's diameter is 0; it has no symmetries")
+        ratio = own / declared
+        if not 1e-9 < ratio < 1e9:
+            raise ibi.InputError(
+                f"{path}: diameter is {declared:g}, that of the model {own:g}; in what unit?"
+            )
+        scale = 10.0 ** round(np.log10(ratio))
+    try:
+        return ibi.Symmetries.from_bop(entry, scale=scale)
+    except (ValueError, TypeError) as error:
+        raise ibi.InputError(f"{path}: {error}") from error
+
+
+def chosen_params(preset: str | None, path: Path | None) -> ibi.Params | None:
+    """Read the parameters of a preset or a file; None where neither is given."""
+    if preset is not None and path is not None:
+        misused("give --preset or --params, not both")
+    if preset is not None:
+        if preset not in PRESETS:
+            misused(f"--preset {preset}: there are {', '.join(PRESETS)}")
+        return PRESETS[preset]()
+    return None if path is None else ibi.Params.load(path)

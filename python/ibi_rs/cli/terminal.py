@@ -1,0 +1,189 @@
+"""The command itself: its app, what it prints, and errors in one line."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Annotated, Any, NoReturn, TypeVar
+
+import ibi_rs as ibi
+from ibi_rs import _interrupts
+from ibi_rs._inputs import _MAX_THREADS
+
+try:
+    with _interrupts.held():
+        import typer
+        from rich.console import Console
+        from typer.core import TyperCommand, TyperGroup
+except ImportError as error:
+    raise SystemExit(f"ibi: the command needs more: pip install 'ibi_rs[cli]' ({error})") from None
+
+FOUND_NOTHING = 3
+"""Exit code of `ibi register` where nothing is found; 1: the input is at fault; 2: the command line is."""
+MAX_THREADS = _MAX_THREADS
+INTERRUPTED = 130
+TERMINATED = 143
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+ERRORS = (ValueError, TypeError, ImportError, OSError)
+"""What a user can do something about: one line. InputError and ParamsError are among them."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a run as Ctrl-C does."""
+
+
+class Printer(Console):
+    """Prints as long as somebody reads."""
+
+    def on_broken_pipe(self) -> None:
+        """Go on without a reader, as `| head -1` is: files are written all the same."""
+        self.quiet = True
+        _discard(self.file)
+
+
+def _discard(stream: Any) -> None:
+    """Send what is still to come, and what Python flushes at its end, nowhere."""
+    with suppress(OSError, ValueError):
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(devnull, stream.fileno())
+        os.close(devnull)
+
+
+class _Group(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        with _in_one_line():
+            return super().invoke(ctx)
+
+
+class _Command(TyperCommand):
+    """Takes `--viewpoint 0,0,0` for `--viewpoint 0 0 0`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        split: list[str] = []
+        wanted = 0  # numbers that the option still lacks
+        for argument in args:
+            name, equals, value = argument.partition("=")
+            if name == "--viewpoint":
+                split, wanted = [*split, name], 3
+                argument = value if equals else ""
+            elif not wanted:
+                split.append(argument)
+                continue
+            numbers = [number for number in argument.replace(",", " ").split() if number]
+            split, wanted = split + numbers, max(0, wanted - len(numbers))
+        return super().parse_args(ctx, split)
+
+
+@contextmanager
+def _in_one_line() -> Iterator[None]:
+    """Turn what a user can do something about into one line and an exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be of any bytes
+    try:
+        with _terminable():
+            yield
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except KeyboardInterrupt as signalled:
+        say("interrupted")
+        raise typer.Exit(TERMINATED if isinstance(signalled, Terminated) else INTERRUPTED) from None
+    except BrokenPipeError:
+        _discard(sys.stdout)
+    except MemoryError:
+        fail("out of memory; a larger --voxel, a smaller scan or fewer --jobs need less")
+    except RecursionError:
+        fail("the input is nested too deeply")
+    except ERRORS as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            _discard(sys.stdout)  # else Python would try again, and fail again, at its end
+            fail(f"cannot print: {error.strerror}")
+        fail(error)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Raise Terminated on SIGTERM, so that nothing half done is left."""
+
+    def terminate(*_: Any) -> NoReturn:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def reason(error: object) -> str:
+    """Say what is wrong in one line, which names the file where there is one."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    # Ours have one line; but a file may have a name of two.
+    return " ".join(lines) if isinstance(error, (ibi.InputError, ibi.ParamsError)) else lines[0]
+
+
+def say(text: str) -> None:
+    """Print a line on stderr."""
+    line = f"ibi: {' '.join(text.splitlines())}"
+    if err.is_terminal:
+        err.print(line, highlight=False, markup=False, soft_wrap=True)  # above a bar
+    elif sys.stderr is not None:
+        with suppress(OSError):  # nobody reads it
+            # Rich would print it again with the next, if Ctrl-C came in between.
+            print(line, file=sys.stderr, flush=True)
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr."""
+    say(f"warning: {text}")
+
+
+def fail(error: object, code: int = 1) -> NoReturn:
+    """End with an error of one line."""
+    say(reason(error))
+    raise typer.Exit(code)
+
+
+def misused(text: str) -> NoReturn:
+    """End with an error of one line that the command line is to blame for."""
+    fail(text, 2)
+
+
+app = typer.Typer(
+    cls=_Group,
+    add_completion=False,
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Find every copy of a part in a scan: poses in six degrees of freedom.",
+)
+
+
+def command(name: str | None = None) -> Callable[[_F], _F]:
+    """Add a command to the app."""
+    return app.command(name, cls=_Command)
+
+
+out = Printer(emoji=False)
+err = Printer(stderr=True, emoji=False)  # a file may be called scan:x:
+
+
+@app.callback(invoke_without_command=True)
+def main(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+) -> None:
+    """Find every copy of a part in a scan: poses in six degrees of freedom."""
+    if version:
+        print(f"ibi_rs {ibi.__version__}")
+        raise typer.Exit
