@@ -56,6 +56,7 @@ pub use detail::Detail;
 pub use error::{Argument, Error};
 pub use evidence::Support;
 pub use interrupt::{CancelToken, Interrupt, Phase, Watcher};
+pub use kernels::par::Pool;
 pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};

@@ -3,7 +3,7 @@
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
-use ibi_core::kernels::par::Pool;
+use ibi_core::Pool;
 use ibi_core::{CancelToken, Interrupt};
 use pyo3::exceptions::PySystemExit;
 use pyo3::prelude::*;
