@@ -120,8 +120,9 @@ impl Model {
         });
         params.validate()?;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
-        let pool = Pool::new(options.run.num_threads)?;
-        let matched = pool.install(|| self.matched(scan, options, &interrupt));
+        // The registrar has a pool of its own, which takes the threads of this one over.
+        let pool = || Pool::new(options.run.num_threads);
+        let matched = pool()?.install(|| self.matched(scan, options, &interrupt));
         let (matched, measured) = match matched {
             Ok(matched) => matched,
             Err(error) if error.is_interrupted() => {
@@ -151,7 +152,7 @@ impl Model {
         };
         let is_over = registration.stop_reason.is_from_outside();
         let of_units = if registration.poses.is_empty() && measured.len() >= doubts::ENOUGH && !is_over {
-            pool.install(|| self.unit_doubt(scan.viewpoint, &measured, &interrupt))?
+            pool()?.install(|| self.unit_doubt(scan.viewpoint, &measured, &interrupt))?
         } else {
             None
         };
