@@ -52,7 +52,12 @@ def translation_error(
 
     Depends on where the model's origin lies; centre the model if its origin means nothing.
 
-    Parameters, raises: those of `rotation_error_deg`.
+    Parameters
+    ----------
+    a, b : array_like, shape (4, 4)
+        Rigid motions.
+    symmetries : Symmetries or array_like of shape (S, 4, 4), optional
+        As in `rotation_error_deg`.
 
     Returns
     -------
@@ -69,7 +74,10 @@ def frobenius_distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
     By this the poses are assigned one to one. It adds numbers without a unit to lengths, so it depends on
     the unit of the data.
 
-    Parameters, raises: `a` and `b` of `rotation_error_deg`.
+    Parameters
+    ----------
+    a, b : array_like, shape (4, 4)
+        Rigid motions.
 
     Returns
     -------
@@ -116,7 +124,15 @@ def add_s(model: npt.ArrayLike, predicted: npt.ArrayLike, truth: npt.ArrayLike) 
     Blind to symmetry, with none declared. Exchanging the two poses changes the value, though little when
     it is small.
 
-    Parameters, returns, raises: those of `add`.
+    Parameters
+    ----------
+    model, predicted, truth : array_like
+        As in `add`, which raises the same.
+
+    Returns
+    -------
+    float
+        In the unit of the data.
 
     References
     ----------
@@ -158,7 +174,15 @@ def mssd(
         them and need not be named. Turns about an axis are tried in BOP's steps, from the nearest one on; a
         ball is turned to the truth.
 
-    Returns, raises: those of `add`; a ValueError too if a symmetry is not a rigid motion.
+    Returns
+    -------
+    float
+        In the unit of the data.
+
+    Raises
+    ------
+    ValueError
+        As of `add`, and if a symmetry is not a rigid motion.
 
     References
     ----------
