@@ -17,6 +17,86 @@ from ibi_rs.params import Params
 from ibi_rs.symmetries import Symmetries
 
 
+@dataclass(frozen=True)
+class Measures:
+    """What was measured of a pose close up, on all that one camera measured; numbers of points.
+
+    Attributes
+    ----------
+    supported, contradicted, buried, hidden, unknown : int
+        Model points that the camera could see: measured where they should be; looked through; a little behind what
+        was measured; behind something else; where nothing was measured.
+    runs_on, ends : int
+        Places just beyond the ends of its faces where the scene goes on in the face's plane, and where it does not.
+    beyond, on : int
+        Points of the thinned scan around it that carry its surface on, and points on it.
+    losses : tuple of float
+        How much worse it fits when it is moved, by 1.5 voxels or more where the scan is noisy, along the three
+        motions that are held least: near 0 where nothing holds it.
+    noise : float
+        Standard deviation of the scan across its surfaces, in voxels.
+    closeness, evidence : float
+        As of a :class:`Pose`, among the points that no other pose owned then.
+    """
+
+    supported: int
+    contradicted: int
+    buried: int
+    hidden: int
+    unknown: int
+    runs_on: int
+    ends: int
+    beyond: int
+    on: int
+    losses: tuple[float, float, float]
+    noise: float
+    closeness: float
+    evidence: float
+
+    @classmethod
+    def _of(cls, raw: dict[str, Any]) -> Measures:
+        tally, contour, overrun = raw["tally"], raw["contour"], raw["overrun"]
+        seen = ("supported", "contradicted", "buried", "hidden", "unknown")
+        return cls(
+            *(tally[name] for name in seen),
+            runs_on=contour["runs_on"],
+            ends=contour["ends"],
+            beyond=overrun["beyond"],
+            on=overrun["on"],
+            losses=tuple(raw["losses"]),
+            noise=raw["noise"],
+            closeness=raw["closeness"],
+            evidence=raw["evidence"],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Rejected:
+    """A pose that passed validation and was given up when it was looked at close up.
+
+    Attributes
+    ----------
+    target_from_source : (4, 4) float64
+        Where it was.
+    score : float
+        The probability that it is right, 0 to 1.
+    objection : str
+        What speaks most against it: ``contradicted`` (the camera looked through it), ``runs_on`` (the scene goes on where its faces should end), ``overrun`` (points around
+        it carry its surface on), ``slips`` (moved a little, it fits as well),
+        ``loose`` (its surface lies off what was measured).
+    round : int
+        The round that found it.
+    measures : Measures
+        What was measured of it.
+    """
+
+    target_from_source: npt.NDArray[np.float64] = field(repr=False)
+    score: float
+    objection: str
+    round: int
+    measures: Measures
+
+
 @dataclass(frozen=True, eq=False)
 class Pose:
     """One instance.
@@ -47,6 +127,9 @@ class Pose:
         Rows of ``corr`` with a residual below ``t_he``, ascending. A row may be an inlier of several poses.
     round : int
         The round that found it.
+    measures : Measures or None
+        What was measured of it close up, where the scene is seen from one side and judged by :class:`Evidence`; the
+        score is theirs then.
     """
 
     target_from_source: npt.NDArray[np.float64]
@@ -58,6 +141,7 @@ class Pose:
     inlier_rmse: float
     inliers: npt.NDArray[np.int64] = field(repr=False)
     round: int
+    measures: Measures | None = field(default=None, repr=False)
 
     @property
     def transformation(self) -> npt.NDArray[np.float64]:
@@ -251,6 +335,8 @@ class Registration(Sequence[Pose]):
         pr in data units.
     params : Params
         The parameters of the run.
+    rejected : tuple of Rejected
+        What passed validation and was given up when it was looked at close up, best score first; at most 100.
     warnings : tuple of str
         What is doubtful about the input, one line each: :meth:`Model.detect` looks for it. Mostly empty.
     """
@@ -265,6 +351,7 @@ class Registration(Sequence[Pose]):
         timings: Timings,
         resolution: float,
         params: Params,
+        rejected: Sequence[Rejected] = (),
         warnings: Sequence[str] = (),
     ) -> None:
         self.poses = tuple(poses)
@@ -274,14 +361,18 @@ class Registration(Sequence[Pose]):
         self.timings = timings
         self.resolution = resolution
         self.params = params
+        self.rejected = tuple(rejected)
         self.warnings = tuple(warnings)
 
     @classmethod
     def _of(cls, raw: dict[str, Any], params: Params) -> Registration:
         """Dress what the core gives."""
-        columns = [raw[field.name] for field in fields(Pose)]
+        measures = [of and Measures._of(of) for of in json.loads(raw["measures"])]
+        columns = [raw[field.name] for field in fields(Pose) if field.name != "measures"]
+        rejected = zip(raw["rejected_poses"], json.loads(raw["rejected"]), strict=True)
         return cls(
-            list(map(Pose, *columns)),
+            list(map(Pose, *columns, measures)),
+            rejected=[Rejected(pose, *told, Measures._of(of)) for pose, (*told, of) in rejected],
             labels=raw["labels"],
             rounds=raw["rounds"],
             stop_reason=StopReason(message=raw["stop_message"], **json.loads(raw["stop_reason"])),

@@ -27,6 +27,10 @@ mod checks;
 mod detail;
 pub mod detection;
 mod error;
+#[cfg(feature = "internals")]
+pub mod evidence;
+#[cfg(not(feature = "internals"))]
+#[allow(dead_code, unused_imports, unreachable_pub, reason = "public with the feature `internals`")]
 mod evidence;
 pub mod features;
 mod grace;
@@ -54,13 +58,13 @@ mod symmetries;
 
 pub use detail::Detail;
 pub use error::{Argument, Error};
-pub use evidence::Support;
+pub use evidence::{Contour, Measures, Objection, Overrun, Support, Tally};
 pub use interrupt::{CancelToken, Interrupt, Phase, Watcher};
 pub use kernels::par::Pool;
 pub use nalgebra;
 pub use params::{Params, Refine, Removal};
 pub use registrar::{Observer, Registrar};
-pub use registration::{Pose, Registration, Round, Timings};
+pub use registration::{Pose, Registration, Rejected, Round, Timings};
 #[cfg(feature = "internals")]
 pub use rounds::Shortcuts;
 pub use rounds::State;

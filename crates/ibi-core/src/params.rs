@@ -200,7 +200,7 @@ impl Params {
             hv: Evidence { t_sure: 1.0, ..Evidence::default() }.into(),
             n_contest: 60,
             removal: Removal::Inliers,
-            max_rejections: Some(150),
+            max_rejections: Some(600),
             ..Self::paper_synthetic()
         }
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crate::error::{Argument, Error};
+use crate::evidence::Closeup;
 use crate::grace::{self, Grace};
 use crate::interrupt::{CancelToken, Interrupt, Phase, Watcher};
 use crate::kernels::par::{self, Pool};
@@ -216,7 +217,7 @@ impl<'a> Registrar<'a> {
         {
             return Err(Error::Missing { argument });
         }
-        let (scene, pairs) = pool.install(|| {
+        let (scene, pairs, closeup) = pool.install(|| {
             interrupt.begin(Phase::Prepare);
             let prepared = PreparedCloud::new(
                 target,
@@ -237,9 +238,11 @@ impl<'a> Registrar<'a> {
             );
             let pairs = pairs?;
             let scene = Scene::new(clouds, near?, measured, tolerances, &interrupt)?;
-            Ok::<_, Error>((scene, pairs))
+            let measured = measured.unwrap_or(&scene.target.points);
+            let closeup = Closeup::new(&scene, measured, &interrupt);
+            Ok::<_, Error>((scene, pairs, closeup))
         })?;
-        Ok(State::new(Problem::new(scene, pairs, interrupt), Arc::clone(pool), start))
+        Ok(State::new(Problem::new(scene, pairs, closeup, interrupt), Arc::clone(pool), start))
     }
 
     /// Whether an optional argument is there; the others always are.

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use nalgebra::Isometry3;
 
+use crate::evidence::{Measures, Objection};
 use crate::stages::Verdict;
 use crate::stop::StopReason;
 
@@ -16,6 +17,8 @@ pub struct Registration {
     pub poses: Vec<Pose>,
     /// For each correspondence the instance (index into `poses`) it fits best with a residual below `t_he`.
     pub labels: Vec<Option<u32>>,
+    /// What passed validation and failed when it was looked at close up, best score first; at most 100.
+    pub rejected: Vec<Rejected>,
     /// One entry per round that was played to its end.
     pub rounds: Vec<Round>,
     /// Why the run ended.
@@ -37,6 +40,7 @@ impl Registration {
         let total_s = start.elapsed().as_secs_f64();
         Self {
             poses: Vec::new(),
+            rejected: Vec::new(),
             labels: vec![None; num_correspondences],
             rounds: Vec::new(),
             stop_reason,
@@ -70,6 +74,26 @@ pub struct Pose {
     /// Ids of all correspondences with a residual below `t_he`, ascending. An id may be an inlier of several
     /// poses.
     pub inliers: Vec<u32>,
+    /// The round that found it.
+    pub round: u32,
+    /// What was measured of it close up, if it was: where a scene is seen from one side and judged by
+    /// [`crate::stages::hv::Evidence`]. Then the score is theirs.
+    pub measures: Option<Measures>,
+}
+
+/// A pose that was given up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[non_exhaustive]
+pub struct Rejected {
+    /// Moved source points to where it was; data units.
+    pub target_from_source: Isometry3<f64>,
+    /// The probability that it is right.
+    pub score: f64,
+    /// What speaks most against it.
+    pub objection: Objection,
+    /// What was measured of it.
+    pub measures: Measures,
     /// The round that found it.
     pub round: u32,
 }

@@ -127,6 +127,12 @@ pub(crate) fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyRe
     result.set_item("inlier_rmse", column(|p| p.inlier_rmse))?;
     result.set_item("inliers", inliers)?;
     result.set_item("round", poses.iter().map(|p| p.round).collect::<Vec<u32>>())?;
+    let measures: Vec<_> = poses.iter().map(|p| p.measures).collect();
+    result.set_item("measures", json(&measures)?)?;
+    let rejected = &registration.rejected;
+    result.set_item("rejected_poses", matrices(py, rejected.iter().map(|r| &r.target_from_source))?)?;
+    let told: Vec<_> = rejected.iter().map(|r| (r.score, r.objection, r.round, r.measures)).collect();
+    result.set_item("rejected", json(&told)?)?;
     result.set_item("labels", PyArray1::from_iter(py, labels))?;
     result.set_item("rounds", json(&registration.rounds)?)?;
     result.set_item("stop_reason", json(&registration.stop_reason)?)?;

@@ -3,6 +3,7 @@
 //!
 //! Does not depend on `ibi-core`, so that no oracle can lean on the code it judges.
 
+pub mod evidence;
 pub mod features;
 pub mod naive;
 mod rng;

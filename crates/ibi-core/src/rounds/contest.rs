@@ -2,14 +2,21 @@
 
 use std::time::Instant;
 
+use nalgebra::Isometry3;
+
 use super::judge::Judged;
 use super::memory::Tried;
 use super::stages::Stages;
 use super::state::State;
+use crate::evidence::Proof;
 use crate::grace::Grace;
 use crate::interrupt::Phase;
 use crate::params::{Params, Removal};
-use crate::stages::Hypothesis;
+use crate::registration::Rejected;
+use crate::stages::{Context, Hypothesis, Verdict};
+
+/// A close look is worth so many others: it tries some tens of poses.
+const PROOF_LOOKS: usize = 64;
 
 /// A contest accepts nothing below this share of its best value.
 const MARGIN: f64 = 0.8;
@@ -18,6 +25,9 @@ const MARGIN: f64 = 0.8;
 #[derive(Debug, Default)]
 pub(crate) struct Contest {
     pub(super) candidates: Vec<Candidate>,
+    /// What passed, and failed when it was looked at closely.
+    /// Each with the pose that passed; what is told of is where that settled.
+    pub(super) rejected: Vec<(Isometry3<f64>, Rejected)>,
     num_rounds: u32,
 }
 
@@ -28,7 +38,34 @@ pub(super) struct Candidate {
     pub(super) value: f64,
     pub(super) round: u32,
     /// How many instances had claimed their points when it was measured.
-    measured_at: u32,
+    pub(super) measured_at: u32,
+    /// What a close look has found, if there was one.
+    pub(super) proof: Option<Proof>,
+}
+
+/// A hypothesis looked at as closely as can be.
+pub(super) struct Looked {
+    pub(super) hypothesis: Hypothesis,
+    pub(super) verdict: Verdict,
+    pub(super) proof: Option<Proof>,
+}
+
+impl Stages<'_> {
+    /// The hypothesis settled and judged on all that was measured or, where there is no more than the clouds, validated on those.
+    pub(super) fn look_closely(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Looked {
+        if self.looks_closely()
+            && let Some(proof) = context.proof(&hypothesis.target_from_source)
+            && let Some(verdict) = self.hv.verdict_of_closeup(proof.measures.log_odds(), proof.explained)
+        {
+            let hypothesis = Hypothesis { target_from_source: proof.target_from_source, ..*hypothesis };
+            return Looked { hypothesis, verdict, proof: Some(proof) };
+        }
+        Looked { hypothesis: *hypothesis, verdict: self.hv.validate(context, hypothesis), proof: None }
+    }
+
+    fn looks_closely(&self) -> bool {
+        self.hv.verdict_of_closeup(0.0, 0.0).is_some()
+    }
 }
 
 impl Contest {
@@ -47,22 +84,28 @@ impl Contest {
 impl State<'_> {
     /// Enters the pose of the round just booked, if it passed. Of two that are the same pose the better one stays; only one
     /// that is new counts as a success.
-    pub(super) fn enter_contest(&mut self, passed: Option<Judged>) {
+    pub(super) fn enter_contest(&mut self, stages: &Stages<'_>, passed: Option<Judged>) {
         self.contest.num_rounds += 1;
         let Some(Judged { hypothesis, verdict }) = passed else { return };
         let (round, measured_at) = (self.num_rounds() - 1, self.num_found());
-        let candidate = Candidate { hypothesis, value: verdict.value, round, measured_at };
+        let candidate = Candidate { hypothesis, value: verdict.value, round, measured_at, proof: None };
         let scene = &self.problem.scene;
         let same = 2.0 * scene.tolerances.t_he_pr * scene.resolution;
-        let is_same = |other: &&mut Candidate| {
-            let [a, b] = [&candidate, &**other].map(|c| &c.hypothesis.target_from_source);
-            scene.source.displacement(a, b) < same
+        let is_same = |other: &Isometry3<f64>| {
+            scene.source.displacement(&candidate.hypothesis.target_from_source, other) < same
         };
-        match self.contest.candidates.iter_mut().find(is_same) {
-            Some(other) if other.value < candidate.value => *other = candidate,
+        if self.contest.rejected.iter().any(|(passed, _)| is_same(passed)) {
+            return;
+        }
+        let mut before = self.contest.candidates.iter_mut();
+        match before.find(|other| is_same(&other.hypothesis.target_from_source)) {
+            // What was looked at closely is better known.
+            Some(other) if other.proof.is_none() && other.value < candidate.value => *other = candidate,
             Some(_) => {}
             None => {
-                self.last_passed_at = self.num_rounds();
+                if !self.problem.has_closeup() || !stages.looks_closely() {
+                    self.last_passed_at = self.num_rounds();
+                }
                 self.contest.candidates.push(candidate);
             }
         }
@@ -79,7 +122,7 @@ impl State<'_> {
         let mut num_accepted = 0;
         while stages.params.max_instances.is_none_or(|limit| self.num_found() < limit) {
             let has_time = grace.allows(self.contest.candidates.len() + 1);
-            if !has_time || !self.measure_candidates(stages, grace) {
+            if !has_time || !self.measure_candidates(stages, grace) || !self.prove_candidates(stages, grace) {
                 break;
             }
             let least = best_value.map_or(f64::NEG_INFINITY, |value: f64| MARGIN * value);
@@ -112,12 +155,61 @@ impl State<'_> {
                 }
                 let context = self.context(stages.params, candidate.round);
                 let verdict = stages.hv.validate(&context, &candidate.hypothesis);
-                (candidate.value, candidate.measured_at) = (verdict.value, now);
+                candidate.measured_at = now;
+                if candidate.proof.is_none() {
+                    candidate.value = verdict.value;
+                }
                 return verdict.accepted();
             }
             true
         });
         self.contest.candidates = candidates;
+        is_complete
+    }
+
+    /// Looks closely at the candidates that have not been looked at so, and drops those that fail. Whether there was time for all
+    /// of them.
+    pub(super) fn prove_candidates(&mut self, stages: &Stages<'_>, grace: &mut Grace<'_>) -> bool {
+        if !self.problem.has_closeup() || !stages.looks_closely() {
+            return true;
+        }
+        let new: Vec<Candidate> =
+            self.contest.candidates.extract_if(.., |candidate| candidate.proof.is_none()).collect();
+        let cost = PROOF_LOOKS * self.problem.cost_of_look();
+        let looked = grace.map(
+            new.len(),
+            |_| cost,
+            |i| stages.look_closely(&self.context(stages.params, new[i].round), &new[i].hypothesis),
+        );
+        let mut is_complete = true;
+        for (candidate, looked) in new.into_iter().zip(looked) {
+            match looked {
+                None => {
+                    is_complete = false;
+                    self.contest.candidates.push(candidate);
+                }
+                Some(Looked { hypothesis, verdict, proof }) if verdict.accepted() => {
+                    self.last_passed_at = self.last_passed_at.max(candidate.round + 1);
+                    self.contest.candidates.push(Candidate {
+                        hypothesis,
+                        value: verdict.value,
+                        proof,
+                        ..candidate
+                    });
+                }
+                Some(Looked { hypothesis, proof, .. }) => {
+                    let measures = proof.map(|proof| proof.measures).unwrap_or_default();
+                    let rejected = Rejected {
+                        target_from_source: hypothesis.target_from_source,
+                        score: measures.score(),
+                        objection: measures.objection(),
+                        measures,
+                        round: candidate.round,
+                    };
+                    self.contest.rejected.push((candidate.hypothesis.target_from_source, rejected));
+                }
+            }
+        }
         is_complete
     }
 
@@ -128,7 +220,7 @@ impl State<'_> {
         if self.contest.candidates[at].value < least {
             return None;
         }
-        let Candidate { hypothesis, value, round, .. } = self.contest.candidates.remove(at);
+        let Candidate { hypothesis, value, round, proof, .. } = self.contest.candidates.remove(at);
         if params.removal == Removal::Inliers {
             let spent = self.context(params, round).witnesses().spent(&hypothesis.target_from_source);
             let num_removed = self.problem.remove(&spent);
@@ -138,7 +230,7 @@ impl State<'_> {
         }
         self.tried = Tried::default();
         self.ahead.forget();
-        self.instances.push(hypothesis, round);
+        self.instances.push(hypothesis, round, proof);
         self.last_passed_at = self.num_rounds();
         Some(value)
     }

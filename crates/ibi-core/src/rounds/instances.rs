@@ -4,6 +4,7 @@ use std::sync::OnceLock;
 
 use nalgebra::Isometry3;
 
+use crate::evidence::Proof;
 use crate::scene::Scene;
 use crate::stages::Hypothesis;
 
@@ -12,6 +13,8 @@ use crate::stages::Hypothesis;
 pub(crate) struct Instance {
     pub(crate) hypothesis: Hypothesis,
     pub(crate) round: u32,
+    /// What a close look has found, if there was one.
+    pub(crate) proof: Option<Proof>,
     overlap: OnceLock<f64>,
 }
 
@@ -39,9 +42,9 @@ pub(crate) struct Instances {
 }
 
 impl Instances {
-    pub(crate) fn push(&mut self, hypothesis: Hypothesis, round: u32) {
+    pub(crate) fn push(&mut self, hypothesis: Hypothesis, round: u32, proof: Option<Proof>) {
         self.poses.push(hypothesis.target_from_source);
-        self.all.push(Instance { hypothesis, round, overlap: OnceLock::new() });
+        self.all.push(Instance { hypothesis, round, proof, overlap: OnceLock::new() });
     }
 
     pub(crate) fn poses(&self) -> &[Isometry3<f64>] {

@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 
 use nalgebra::Isometry3;
 
-use crate::evidence::{Chance, Claims, LOOK_NEAR, Support};
+use crate::evidence::{Chance, Claims, Closeup, LOOK_NEAR, Support};
 use crate::interrupt::Interrupt;
 use crate::kernels::graph::Graph;
 use crate::params::Params;
@@ -22,11 +22,17 @@ pub(crate) struct Problem<'a> {
     is_first_look: bool,
     votes: OnceLock<Vec<Option<[f32; 3]>>>,
     chance: OnceLock<Chance>,
+    closeup: Option<Closeup>,
     pub(crate) interrupt: Interrupt,
 }
 
 impl<'a> Problem<'a> {
-    pub(crate) fn new(scene: Scene<'a>, pairs: PointPairs, interrupt: Interrupt) -> Self {
+    pub(crate) fn new(
+        scene: Scene<'a>,
+        pairs: PointPairs,
+        closeup: Option<Closeup>,
+        interrupt: Interrupt,
+    ) -> Self {
         let (alive, barred) = (Alive::all(&pairs), vec![false; pairs.len()]);
         Self {
             scene,
@@ -37,6 +43,7 @@ impl<'a> Problem<'a> {
             is_first_look: true,
             votes: OnceLock::new(),
             chance: OnceLock::new(),
+            closeup,
             interrupt,
         }
     }
@@ -62,6 +69,7 @@ impl<'a> Problem<'a> {
             is_first_look: self.is_first_look,
             votes: &self.votes,
             chance: &self.chance,
+            closeup: self.closeup.as_ref(),
             interrupt: &self.interrupt,
         }
     }
@@ -86,6 +94,11 @@ impl<'a> Problem<'a> {
             barred[id as usize] = true;
         }
         barred
+    }
+
+    /// Whether there is more to look at than the clouds.
+    pub(crate) fn has_closeup(&self) -> bool {
+        self.closeup.is_some()
     }
 
     /// Whether the graph is one of a part of the correspondences.

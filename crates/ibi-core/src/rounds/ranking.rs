@@ -14,6 +14,9 @@ use crate::registration::{Pose, Registration};
 use crate::scene::Scene;
 use crate::stop::StopReason;
 
+/// Rejected poses that are told of.
+const MAX_REJECTED: usize = 100;
+
 impl State<'_> {
     /// The result: `supports` tells what speaks for each instance. Those for which there is no time are left out.
     pub(crate) fn into_registration(
@@ -40,7 +43,11 @@ impl State<'_> {
             ControlFlow::Break(reason) if !stop_reason.is_from_outside() => reason,
             _ => stop_reason,
         };
+        let mut rejected: Vec<_> = self.contest.rejected.into_iter().map(|(_, rejected)| rejected).collect();
+        rejected.sort_by(|a, b| b.score.total_cmp(&a.score));
+        rejected.truncate(MAX_REJECTED);
         Registration {
+            rejected,
             poses: measured.into_iter().map(|(pose, _)| pose).collect(),
             labels,
             rounds: self.rounds,
@@ -68,7 +75,7 @@ fn measure(problem: &Problem<'_>, instance: &Instance, support: &Support) -> (Po
     let mean_sq = residuals_sq.iter().sum::<f64>() / residuals_sq.len().max(1) as f64;
     let pose = Pose {
         target_from_source: pose,
-        score: support.score(),
+        score: instance.proof.map_or_else(|| support.score(), |proof| proof.measures.score()),
         overlap: instance.overlap(scene),
         closeness: support.closeness(),
         back_fit: support.back_fit,
@@ -76,6 +83,7 @@ fn measure(problem: &Problem<'_>, instance: &Instance, support: &Support) -> (Po
         inlier_rmse: mean_sq.sqrt(),
         inliers,
         round: instance.round,
+        measures: instance.proof.map(|proof| proof.measures),
     };
     (pose, residuals_sq)
 }

@@ -178,7 +178,7 @@ impl<'a> State<'a> {
     /// it is time. Breaks if the next round would be the same again.
     pub(crate) fn conclude(&mut self, stages: &Stages<'_>, play: Play) -> ControlFlow<StopReason, Round> {
         let verdict = play.judged.map(|judged| judged.verdict);
-        self.book(stages.params, play);
+        self.book(stages, play);
         if verdict.is_some_and(|verdict| verdict.accepted() && stages.hv.is_sure(&verdict)) {
             self.accept_sure(stages);
         }
@@ -197,7 +197,8 @@ impl<'a> State<'a> {
     }
 
     /// Books a round: removes or bars correspondences, enters the hypothesis for the contest if it passed.
-    fn book(&mut self, params: &Params, play: Play) {
+    fn book(&mut self, stages: &Stages<'_>, play: Play) {
+        let params = stages.params;
         let Play { seeds, dense, estimate, judged } = play;
         if let (Some(raw), Some(judged)) = (estimate.hypothesis, judged) {
             self.tried.add(&raw.target_from_source, judged);
@@ -231,7 +232,7 @@ impl<'a> State<'a> {
             num_removed: self.problem.remove(removed),
             num_barred: self.problem.bar(&barred),
         });
-        self.enter_contest(passed);
+        self.enter_contest(stages, passed);
     }
 
     /// Breaks if no further round may be played.
@@ -280,7 +281,10 @@ impl<'a> State<'a> {
     fn accept_sure(&mut self, stages: &Stages<'_>) {
         let interrupt = self.problem.interrupt.clone();
         let mut grace = Grace::none(&interrupt);
-        if self.measure_candidates(stages, &mut grace) && self.turn_best(stages, &mut grace) {
+        if self.measure_candidates(stages, &mut grace)
+            && self.prove_candidates(stages, &mut grace)
+            && self.turn_best(stages, &mut grace)
+        {
             self.accept_best(stages.params, f64::NEG_INFINITY);
         }
     }

@@ -1,6 +1,6 @@
 //! Trying a pose the other ways round: parts that look alike from several sides are often found turned.
 
-use super::contest::Candidate;
+use super::contest::{Candidate, Looked};
 use super::stages::Stages;
 use super::state::State;
 use crate::detail::Detail;
@@ -34,20 +34,24 @@ impl State<'_> {
         );
         let Some(mut glances) = glances.into_iter().collect::<Option<Vec<_>>>() else { return false };
         glances.sort_by(|(a, _), (b, _)| b.total_cmp(a));
-        let mut best = (value, hypothesis);
+        let mut best = None;
+        let mut best_value = value;
         for (_, pose) in &glances[..NUM_TURNS] {
             if !grace.allows(8 * cost) {
                 return false;
             }
             let target_from_source = scene.icp(Detail::Look, pose);
             let turned = Hypothesis { target_from_source, ..hypothesis };
-            let verdict = stages.hv.validate(&context, &turned);
-            if verdict.value > best.0 {
-                best = (verdict.value, turned);
+            let looked = stages.look_closely(&context, &turned);
+            if looked.verdict.value > best_value {
+                best_value = looked.verdict.value;
+                best = Some(looked);
             }
         }
-        let candidate = &mut self.contest.candidates[at];
-        (candidate.value, candidate.hypothesis) = best;
+        if let Some(Looked { hypothesis, verdict, proof }) = best {
+            let candidate = &mut self.contest.candidates[at];
+            *candidate = Candidate { hypothesis, value: verdict.value, proof, ..*candidate };
+        }
         true
     }
 }

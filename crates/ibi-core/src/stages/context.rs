@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use nalgebra::Isometry3;
 
 use crate::detail::Detail;
-use crate::evidence::{Chance, Claims, Support, Witnesses};
+use crate::evidence::{Chance, Claims, Closeup, Proof, Support, Witnesses};
 use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::graph::Graph;
 use crate::kernels::rng::{Rng, Stage};
@@ -43,6 +43,8 @@ pub struct Context<'a> {
     pub votes: &'a OnceLock<Vec<Option<[f32; 3]>>>,
     /// What chance brings in this scene.
     pub(crate) chance: &'a OnceLock<Chance>,
+    /// What was measured in all, where the scene is seen from one side.
+    pub(crate) closeup: Option<&'a Closeup>,
     /// Asked by long computations, which may then return anything: the round is thrown away.
     pub interrupt: &'a Interrupt,
 }
@@ -78,6 +80,15 @@ impl Context<'_> {
     #[must_use]
     pub fn support(&self, detail: Detail, target_from_source: &Isometry3<f64>, exclusive: bool) -> Support {
         self.witnesses().support(self.chance(), detail, target_from_source, exclusive)
+    }
+
+    /// The pose settled on all that was measured, and what speaks for it and against it there; `None` where there is no more to
+    /// look at than the clouds.
+    pub(crate) fn proof(&self, target_from_source: &Isometry3<f64>) -> Option<Proof> {
+        let mut proof = self.closeup?.look(self.scene, target_from_source);
+        let support = self.support(Detail::Look, &proof.target_from_source, true);
+        (proof.measures.closeness, proof.measures.evidence) = (support.closeness(), support.evidence());
+        Some(proof)
     }
 
     /// The random stream of `stage` in this round, and no other's.

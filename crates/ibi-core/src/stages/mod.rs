@@ -63,6 +63,13 @@ pub trait Validate: Send + Sync {
         None
     }
 
+    /// The verdict on a pose that was looked at close up, on all that one camera measured: `log_odds` speaks for it, and it
+    /// explains the share `explained` of the source. `None`, which is the default, leaves it at what [`Self::validate`] said.
+    fn verdict_of_closeup(&self, log_odds: f64, explained: f64) -> Option<Verdict> {
+        let _ = (log_odds, explained);
+        None
+    }
+
     /// Whether the verdict depends on nothing but the pose, what is alive and what is claimed. Then a hypothesis that ends
     /// up where another one was judged is not judged again. By default it may depend on more.
     fn is_repeatable(&self) -> bool {

@@ -16,6 +16,7 @@ mod dense_graph;
 mod detection;
 mod errors;
 mod evidence;
+mod evidence_measured;
 mod features;
 mod floors;
 // Parameters in the golden files are JSON.

@@ -63,9 +63,13 @@ impl Evidence {
         if !support.one_sided {
             return verdict;
         }
-        let Verdict { value, threshold } = verdict;
-        Verdict { value: threshold + (value - threshold) * support.explained / USUALLY_EXPLAINED, threshold }
+        in_proportion(verdict, support.explained)
     }
+}
+
+/// The margin of a verdict in proportion to how much of the source is explained.
+fn in_proportion(Verdict { value, threshold }: Verdict, explained: f64) -> Verdict {
+    Verdict { value: threshold + (value - threshold) * explained / USUALLY_EXPLAINED, threshold }
 }
 
 impl Validate for Evidence {
@@ -82,6 +86,10 @@ impl Validate for Evidence {
         let verdict = self.verdict(&support);
         let margin = if support.one_sided { GLANCE_MARGIN_ONE_SIDED } else { GLANCE_MARGIN };
         (verdict.value < verdict.threshold - margin).then_some(verdict)
+    }
+
+    fn verdict_of_closeup(&self, log_odds: f64, explained: f64) -> Option<Verdict> {
+        Some(in_proportion(Verdict { value: log_odds, threshold: self::log_odds(self.t_score) }, explained))
     }
 
     fn is_sure(&self, verdict: &Verdict) -> bool {

@@ -55,6 +55,13 @@ impl Validate for Hv {
         }
     }
 
+    fn verdict_of_closeup(&self, log_odds: f64, explained: f64) -> Option<Verdict> {
+        match self {
+            Self::Evidence(evidence) => evidence.verdict_of_closeup(log_odds, explained),
+            _ => Option::None,
+        }
+    }
+
     fn is_sure(&self, verdict: &Verdict) -> bool {
         match self {
             Self::Evidence(evidence) => evidence.is_sure(verdict),

@@ -1,0 +1,197 @@
+//! Looking at a pose close up, on all that was measured: it is settled, and held against every ray.
+
+use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
+
+use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
+use super::noise::noise_of_rays;
+use super::odds::Measures;
+use super::rays::Rays;
+use super::seen::{Look, Seen, Tally, Tolerance, faces, look, merge};
+use super::settle::{Steps, settle};
+use super::slip::{information, losses, moved, principal_motions, worth};
+use crate::detail::Detail;
+use crate::interrupt::Interrupt;
+use crate::scene::Scene;
+
+/// What one eye or several have measured in all, and where the source's faces end.
+#[derive(Debug)]
+pub(crate) struct Closeup {
+    rays: Vec<Rays>,
+    rim: Rim,
+    voxel: f64,
+    noise: f64,
+    tolerance: Tolerance,
+}
+
+/// What a close look has found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Proof {
+    /// The pose, settled.
+    pub(crate) target_from_source: Isometry3<f64>,
+    pub(crate) measures: Measures,
+    /// Share of the source that is supported.
+    pub(crate) explained: f64,
+}
+
+/// A cloud that was thinned to a voxel has its points so many of them apart, about.
+const VOXELS_PER_SPACING: f64 = 1.25;
+
+/// How far a face is followed beyond its end, at least, voxels and tolerances; and how far the surface must have fallen away there,
+/// tolerances.
+const RIM_VOXELS: f64 = 1.5;
+const RIM_TOLERANCES: f64 = 2.0;
+const FALLEN_TOLERANCES: f64 = 1.3;
+
+/// Steps of the last polish, voxels; and how far it moves the surface across itself at a time, tolerances.
+const FIRST_STEP: f64 = 1.0;
+const LEAST_STEP: f64 = 0.12;
+const ACROSS: f64 = 0.5;
+const ROUNDS: u32 = 6;
+
+/// To settle a pose, one in so many points of the source is looked at.
+const SETTLE_STEP: usize = 2;
+
+/// A pose that so few points support has nothing to be settled by.
+const FEW_SUPPORTED: usize = 6;
+
+/// How far a pose is moved to see what it loses, tolerances: 1.5 voxels of a scan without noise.
+const SLIP_STEP: f64 = 3.75;
+
+/// The source where a pose puts it, and how each point is seen.
+struct At {
+    points: Vec<Point3<f64>>,
+    normals: Vec<Vector3<f64>>,
+    sight: Vec<Look>,
+}
+
+impl Closeup {
+    /// Of what was `measured` from the viewpoint of a scene with oriented normals. `None` for others, or if interrupted.
+    pub(crate) fn new(scene: &Scene<'_>, measured: &[Point3<f64>], interrupt: &Interrupt) -> Option<Self> {
+        let normals = scene.source.normals.as_ref().filter(|_| scene.is_one_sided())?;
+        let rays = vec![Rays::new(scene.target.viewpoint?, measured)?];
+        if interrupt.is_set() {
+            return None;
+        }
+        let voxel = VOXELS_PER_SPACING * scene.resolution;
+        let noise = noise_of_rays(&rays[0], measured);
+        let tolerance = Tolerance::of(voxel, noise);
+        let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
+        let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);
+        Some(Self { rays, rim, voxel, noise, tolerance })
+    }
+
+    /// A pose settled, and what was measured of it.
+    pub(crate) fn look(&self, scene: &Scene<'_>, target_from_source: &Isometry3<f64>) -> Proof {
+        let Self { voxel, tolerance, .. } = *self;
+        let size = scene.source.radius;
+        let across = ACROSS * tolerance.across;
+        let steps = Steps { first: FIRST_STEP * voxel, least: LEAST_STEP * voxel, across, rounds: ROUNDS };
+        let motions = |pose: &Isometry3<f64>| {
+            let at = self.at(scene, pose, SETTLE_STEP);
+            let information = information_of(scene, pose, &at);
+            information.map_or_else(Vec::new, |(information, count)| {
+                let principal = principal_motions(&(information / count as f64), size);
+                principal.map(|(motion, deviation)| (motion, deviation.recip())).to_vec()
+            })
+        };
+        let shifted = |pose: &Isometry3<f64>, motion: &_| moved(motion, &(pose * scene.source.centre), pose);
+        let (pose, value) =
+            settle(target_from_source, steps, motions, shifted, |pose| self.worth(scene, pose));
+        self.measured(scene, &pose, value)
+    }
+
+    /// What is measured of a settled pose of a `worth`.
+    fn measured(&self, scene: &Scene<'_>, pose: &Isometry3<f64>, worth: f64) -> Proof {
+        let Self { voxel, tolerance, noise, .. } = *self;
+        let source = scene.source;
+        let (at, centre) = (self.at(scene, pose, 1), pose * source.centre);
+        let placed = at.placed(pose);
+        let scan = Self::scan(scene);
+        let overrun = scan.map_or_else(Default::default, |scan| {
+            let ball = (&source.centre, source.radius);
+            overrun(&scene.near_source, ball, scan, placed, tolerance.across, voxel)
+        });
+        let mut losses_of = [0.0; 3];
+        if let Some((information, count)) = information_of(scene, pose, &at) {
+            let motions = principal_motions(&(information / count as f64), source.radius);
+            let ball = (&centre, source.radius);
+            let worth_of = |pose: &Isometry3<f64>| self.worth(scene, pose);
+            losses_of = losses(pose, &motions, ball, SLIP_STEP * tolerance.across, worth, worth_of);
+        }
+        let tally = Tally::of(&at.sight);
+        Proof {
+            target_from_source: *pose,
+            explained: f64::from(tally.supported) / source.points.len() as f64,
+            measures: Measures {
+                tally,
+                contour: self.contour(scene, placed),
+                overrun,
+                losses: losses_of,
+                noise: noise / voxel,
+                ..Measures::default()
+            },
+        }
+    }
+
+    /// What a pose is worth, see [`worth`].
+    fn worth(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> f64 {
+        let at = self.at(scene, pose, SETTLE_STEP);
+        let run_on: f64 =
+            self.rays.iter().map(|rays| run_on(&self.rim, rays, at.placed(pose), self.tolerance)).sum();
+        let is_asked = |row: &&u32| at.sight[**row as usize].seen != Seen::Away;
+        let num_ends = self.rim.rows.iter().filter(is_asked).count() as u32;
+        worth(&at.sight, run_on, num_ends, self.tolerance.across)
+    }
+
+    fn contour(&self, scene: &Scene<'_>, placed: Placed<'_>) -> Contour {
+        let rays = Some(&self.rays[0]).filter(|_| self.rays.len() == 1);
+        Self::scan(scene).map_or_else(Contour::default, |scan| {
+            contour(&self.rim, scan, rays, placed, self.tolerance, self.voxel)
+        })
+    }
+
+    fn scan<'s>(scene: &'s Scene<'_>) -> Option<Scan<'s>> {
+        let normals = scene.target.normals.as_deref()?;
+        Some(Scan { points: &scene.target.points, normals, nearby: &scene.near_target })
+    }
+
+    /// Where a pose puts the source; one in so many of its points is looked at.
+    fn at(&self, scene: &Scene<'_>, pose: &Isometry3<f64>, step: usize) -> At {
+        let source = scene.source;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let points: Vec<_> = source.points.iter().map(|p| rotation * p + pose.translation.vector).collect();
+        let normals: Vec<_> = source.normals.iter().flatten().map(|n| rotation * n).collect();
+        let mut of_all: Option<Vec<Look>> = None;
+        for rays in &self.rays {
+            let own = source.own_shadow(Detail::Look);
+            let is_hidden = own.map_or(&[][..], |own| own.from(rays.eye(), pose));
+            let of = |(i, (at, normal)): (usize, (&Point3<f64>, &Vector3<f64>))| {
+                let is_shown = i % step == 0 && is_hidden.get(i) != Some(&true);
+                let is_asked = is_shown && faces(rays.eye(), at, normal);
+                if is_asked { look(rays, at, normal, self.tolerance) } else { Look::of(Seen::Away) }
+            };
+            let of_one: Vec<Look> = points.iter().zip(&normals).enumerate().map(of).collect();
+            match &mut of_all {
+                None => of_all = Some(of_one),
+                Some(of_all) => merge(of_all, &of_one),
+            }
+        }
+        At { points, normals, sight: of_all.unwrap_or_default() }
+    }
+}
+
+/// The information of the supported points for a noise of 1, and how many they are; `None` if too few.
+fn information_of(scene: &Scene<'_>, pose: &Isometry3<f64>, at: &At) -> Option<(Matrix6<f64>, usize)> {
+    let seen = at.points.iter().zip(&at.normals).zip(&at.sight);
+    let (points, normals): (Vec<_>, Vec<_>) =
+        seen.filter(|(_, look)| look.seen == Seen::Supported).map(|((p, n), _)| (*p, *n)).unzip();
+    let count = points.len();
+    let centre = pose * scene.source.centre;
+    (count >= FEW_SUPPORTED).then(|| (information(&points, &normals, &centre, 1.0), count))
+}
+
+impl At {
+    fn placed<'a>(&'a self, target_from_source: &'a Isometry3<f64>) -> Placed<'a> {
+        Placed { target_from_source, points: &self.points, normals: &self.normals, sight: &self.sight }
+    }
+}

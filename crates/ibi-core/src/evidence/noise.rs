@@ -1,0 +1,67 @@
+//! How far the points of a scan lie off the surface that they were measured on.
+
+use nalgebra::{Matrix3, Point3, Vector3};
+
+use super::rays::Rays;
+use crate::kernels::nearby::Nearby;
+
+/// Points that a plane is laid through.
+const NEIGHBORS: usize = 12;
+
+/// Of a plane through points.
+const FREEDOMS: usize = 3;
+
+/// Points that are asked.
+const SAMPLE: usize = 1024;
+
+/// The standard deviation, across the surface, of the points that an eye measured: the median over some of them of how far the
+/// 12 whose rays are nearest lie off their common plane. Edges are too few to count, curvature is too slight from one ray to the
+/// next. What bends a whole surface (a lens, a wavy depth) is not in it. 0 for fewer than 12 points.
+#[must_use]
+pub fn noise_of_rays(rays: &Rays, points: &[Point3<f64>]) -> f64 {
+    // A disc of 4 spacings holds some 50 rays of a regular image.
+    let around = |point: &Point3<f64>| {
+        let to = (point - rays.eye()).normalize();
+        let mut near = Vec::new();
+        rays.each_near(point, 4.0 * rays.spacing(), |end, _| {
+            near.push((to.cross(end).norm_squared() / end.norm_squared(), Point3::from(*end)));
+        });
+        near
+    };
+    median_roughness(points, around)
+}
+
+/// The same of a scan that no single eye made: of the 12 nearest points, within the reach of `nearby`, which holds the points.
+#[must_use]
+pub fn noise_of_cloud(points: &[Point3<f64>], nearby: &Nearby) -> f64 {
+    let around = |point: &Point3<f64>| {
+        let rows = nearby.within(point, nearby.reach());
+        rows.map(|row| ((points[row as usize] - point).norm_squared(), points[row as usize])).collect()
+    };
+    median_roughness(points, around)
+}
+
+fn median_roughness(points: &[Point3<f64>], around: impl Fn(&Point3<f64>) -> Vec<(f64, Point3<f64>)>) -> f64 {
+    let some = points.iter().step_by(points.len().div_ceil(SAMPLE).max(1));
+    let mut all: Vec<f64> = some.filter_map(|point| roughness(around(point))).collect();
+    let middle = all.len() / 2;
+    if all.is_empty() { 0.0 } else { *all.select_nth_unstable_by(middle, f64::total_cmp).1 }
+}
+
+/// Root mean square distance of the nearest of some points from their plane, for as many degrees of freedom as it leaves.
+fn roughness(mut near: Vec<(f64, Point3<f64>)>) -> Option<f64> {
+    if near.len() < NEIGHBORS {
+        return None;
+    }
+    let order = |a: &(f64, Point3<f64>), b: &(f64, Point3<f64>)| {
+        let [a, b] = [a, b].map(|(far, p)| (*far, p.x, p.y, p.z));
+        a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.total_cmp(&b.2)).then(a.3.total_cmp(&b.3))
+    };
+    near.select_nth_unstable_by(NEIGHBORS - 1, order);
+    near.truncate(NEIGHBORS);
+    let middle = near.iter().map(|(_, p)| p.coords).sum::<Vector3<f64>>() / NEIGHBORS as f64;
+    let spread: Matrix3<f64> =
+        near.iter().map(|(_, p)| (p.coords - middle) * (p.coords - middle).transpose()).sum();
+    let least = spread.symmetric_eigenvalues().min().max(0.0);
+    Some((least / (NEIGHBORS - FREEDOMS) as f64).sqrt())
+}

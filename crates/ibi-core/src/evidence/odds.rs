@@ -1,0 +1,127 @@
+//! What all measures of a pose come to: the odds that it is right.
+
+use super::contour::{Contour, Overrun};
+use super::seen::Tally;
+
+/// What was measured of a pose.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+pub struct Measures {
+    /// How its points are seen.
+    pub tally: Tally,
+    /// What is beyond the ends of its faces.
+    pub contour: Contour,
+    /// What is around it.
+    pub overrun: Overrun,
+    /// What it loses when it is moved a little; see [`super::slip::losses`].
+    pub losses: [f64; 3],
+    /// Standard deviation of the scan across its surfaces, voxels.
+    pub noise: f64,
+    /// How close its points lie on the thinned clouds, see [`super::Support::closeness`].
+    pub closeness: f64,
+    /// -log10 of the chance that as many correspondences would agree, see [`super::Support::evidence`].
+    pub evidence: f64,
+}
+
+/// So many points, or ends, are worth as much as what is believed without any.
+const FEW_POINTS: f64 = 20.0;
+const FEW_ENDS: f64 = 15.0;
+
+/// Of the ends of a pose of which nothing is known, the share that would run on.
+const USUALLY_RUNS_ON: f64 = 0.5;
+
+/// More says no more: of what is contradicted to what is known, and of what is beyond a part to what is on it.
+const MOST_CONTRADICTED: f64 = 0.3;
+const MOST_BEYOND: f64 = 0.2;
+
+/// Closeness beyond these says no more.
+const CLOSENESS: [f64; 2] = [-0.5, 1.1];
+
+/// Weights of 1, contradicted, running on, beyond, the second and third loss, and closeness, where a scan is sharp: a logistic
+/// regression over the poses, right and wrong, of searches in the tuning half of `benchmarks/verdict.py`, as they stand when it is
+/// decided on them; `benchmarks/verdict_fit.py` fits them anew. The least loss told nothing beside the others.
+const SHARP: [f64; 7] = [-2.48, -5.5, -3.18, -37.9, 2.7, 0.23, 2.22];
+
+/// The same where the noise is as large as what is to be told apart: then what the clouds say ([`super::Support`]) holds, and what
+/// runs on or lies beyond a part speaks against it.
+const BLURRED: [f64; 5] = [-4.6, -6.0, -37.0, 0.05, 9.7];
+
+/// Standard deviations of the noise, voxels: up to the first a scan is sharp, from the second on it is blurred.
+const NOISE: [f64; 2] = [0.12, 0.24];
+
+/// Of a loss the root: the step from none to a little tells most.
+fn held(loss: f64) -> f64 {
+    loss.clamp(0.0, 1.0).sqrt()
+}
+
+impl Measures {
+    /// Share contradicted, how far faces run on, share beyond: 0 where nothing is known, so that the unknown speaks neither for a pose
+    /// nor against it.
+    #[must_use]
+    pub fn objections(&self) -> [f64; 3] {
+        let Self { tally, contour, overrun, .. } = self;
+        let [contradicted, known] = [tally.contradicted, tally.known()].map(f64::from);
+        let [runs_on, ends] = [contour.runs_on, contour.ends].map(f64::from);
+        let [beyond, on] = [overrun.beyond, overrun.on].map(f64::from);
+        [
+            (contradicted / (known + FEW_POINTS)).min(MOST_CONTRADICTED),
+            (runs_on - USUALLY_RUNS_ON * (runs_on + ends)) / (runs_on + ends + FEW_ENDS),
+            (beyond / (on + FEW_POINTS)).min(MOST_BEYOND),
+        ]
+    }
+
+    /// Logarithm of the odds that the pose is right.
+    #[must_use]
+    pub fn log_odds(&self) -> f64 {
+        let [contradicted, runs_on, beyond] = self.objections();
+        let closeness = self.closeness.clamp(CLOSENESS[0], CLOSENESS[1]);
+        let [_, second, third] = self.losses.map(held);
+        let sharp = [1.0, contradicted, runs_on, beyond, second, third, closeness];
+        let blurred = [1.0, runs_on, beyond, self.evidence.ln_1p(), self.closeness];
+        let blur = ((self.noise - NOISE[0]) / (NOISE[1] - NOISE[0])).clamp(0.0, 1.0);
+        let weighed =
+            |terms: &[f64], weights: &[f64]| -> f64 { terms.iter().zip(weights).map(|(a, b)| a * b).sum() };
+        (1.0 - blur) * weighed(&sharp, &SHARP) + blur * weighed(&blurred, &BLURRED)
+    }
+
+    /// The probability that the pose is right.
+    #[must_use]
+    pub fn score(&self) -> f64 {
+        1.0 / (1.0 + (-self.log_odds()).exp())
+    }
+
+    /// What speaks most against the pose.
+    #[must_use]
+    pub fn objection(&self) -> Objection {
+        let [contradicted, runs_on, beyond] = self.objections();
+        let [_, second, third] = self.losses.map(held);
+        let all = [
+            (SHARP[1] * contradicted, Objection::Contradicted),
+            (SHARP[2] * runs_on, Objection::RunsOn),
+            (SHARP[3] * beyond, Objection::Overrun),
+            (SHARP[4] * (second - USUALLY_HELD) + SHARP[5] * (third - USUALLY_HELD), Objection::Slips),
+            (SHARP[6] * (self.closeness.clamp(CLOSENESS[0], CLOSENESS[1]) - 1.0), Objection::Loose),
+        ];
+        all.into_iter().min_by(|(a, _), (b, _)| a.total_cmp(b)).map_or(Objection::Loose, |(_, worst)| worst)
+    }
+}
+
+/// How well a right pose is held along a motion, about.
+const USUALLY_HELD: f64 = 0.5;
+
+/// What speaks most against a pose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
+#[non_exhaustive]
+pub enum Objection {
+    /// The eye looked through it.
+    Contradicted,
+    /// The scene goes on where its faces should end.
+    RunsOn,
+    /// Points around it carry its surface on.
+    Overrun,
+    /// Moved a little, it fits as well.
+    Slips,
+    /// Its surface lies off what was measured.
+    Loose,
+}
