@@ -13,22 +13,36 @@ Examples
 8
 """
 
+from .bins import Bin, bin_scene, row_scene
+from .camera import DepthImage
 from .ecc import ecc_layout
 from .fpfh import fpfh_layout
 from .outlier import outlier_layout
 from .piles import Pile, pile_scene
+from .rooms import Room, room_scene
 from .scene import INLIER_DISTANCE, Scene
 from .shapes import SHAPES, sample_mesh, shape
+from .solids import FURNITURE, PARTS, furniture_mesh, part_mesh
 
 __all__ = [
+    "FURNITURE",
     "INLIER_DISTANCE",
+    "PARTS",
     "SHAPES",
+    "Bin",
+    "DepthImage",
     "Pile",
+    "Room",
     "Scene",
+    "bin_scene",
     "ecc_layout",
     "fpfh_layout",
+    "furniture_mesh",
     "outlier_layout",
+    "part_mesh",
     "pile_scene",
+    "room_scene",
+    "row_scene",
     "sample_mesh",
     "shape",
 ]
