@@ -84,10 +84,10 @@ class Solids:
         return t, np.where(np.isfinite(t), owner, -1), normals
 
     def is_blocked(self, starts: Array, ends: Array) -> NDArray[np.bool_]:
-        """Whether something lies between two points, (..., 3) each, but for a thousandth at both ends."""
+        """Whether something lies between two points, (..., 3) each, but for a ten-thousandth at both ends."""
         rays = np.concatenate([starts, ends - starts], axis=-1).astype(np.float32)
         blocked: NDArray[np.bool_] = self._scene.test_occlusions(
-            self._o3d.core.Tensor(rays), tnear=1e-3, tfar=1 - 1e-3
+            self._o3d.core.Tensor(rays), tnear=1e-4, tfar=1 - 1e-4
         ).numpy()
         return blocked
 
