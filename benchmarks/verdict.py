@@ -26,7 +26,7 @@ from pathlib import Path
 
 import ibi_rs as ibi
 import numpy as np
-from frame import cli, ours, records, runs, tables
+from frame import cli, ours, plots, records, runs, tables
 from frame.records import Row
 from frame.scans import FOLDER
 from frame.tables import show
@@ -36,12 +36,12 @@ from verdict_pictures import draw
 from verdict_searches import GAPS, KINDS, ROWS, SIZES, Models, Search, outlier_scenes
 
 PAGE = records.DOCS / "verdict.md"
-RECORD, POSES, BEFORE, BEFORE_POSES = (
-    "verdict.csv",
-    "verdict_poses.csv",
-    "verdict_before.csv",
-    "verdict_before_poses.csv",
-)
+PICTURE = "verdict_reliability.png"
+RECORDS = {
+    "before": ("verdict_before.csv", "verdict_before_poses.csv"),
+    "now": ("verdict.csv", "verdict_poses.csv"),
+}
+"""Searches and poses of each column of the page; before: as it was when this was first measured."""
 OUTLIERS = "outliers"
 LOW_SCORE = 0.02
 NO_LOW = ("absent", "mirror", "sizes")
@@ -365,14 +365,47 @@ def calibration(rows: Sequence[Row]) -> str:
     return f"{calibration_error(scores, right):.2f} / {brier(scores, right):.2f} ({len(rows)})"
 
 
+def draw_reliability(columns: dict[str, tuple[Sequence[Row], str]], path: Path) -> None:
+    """Draw, for each regime, the share of right poses over the score, those of low score among them."""
+    regimes = list(dict.fromkeys(row["regime"] for rows, _ in columns.values() for row in rows))
+    figure, axes = plots.panels(
+        (3 * 4, 2.9 * -(-len(regimes) // 4)), 4, -(-len(regimes) // 4), count=len(regimes)
+    )
+    for axis, regime in zip(axes, regimes, strict=True):
+        axis.plot([0, 1], [0, 1], color="0.7", linestyle="--", zorder=1)
+        for (name, (rows, half)), color in zip(columns.items(), ("0.45", "#2166ac"), strict=False):
+            of = [row for row in rows if (row["regime"], row["half"]) == (regime, half)]
+            of = [row for row in of if row["state"] != UNKNOWN]
+            of = [row for row in of if row["run"] == LOW] or of
+            scores = np.array([float(row["score"]) for row in of])
+            right = np.array([row["state"] in (RIGHT, HIDDEN) for row in of], dtype=float)
+            tenth = np.minimum((scores * 10).astype(int), 9)
+            held = [tenth == i for i in range(10) if (tenth == i).any()]
+            axis.scatter(
+                [scores[rows].mean() for rows in held],
+                [right[rows].mean() for rows in held],
+                s=[8 + 120 * rows.mean() for rows in held],
+                color=color,
+                label=f"{name}, {len(of)} poses",
+                zorder=2,
+            )
+        axis.set(title=regime, xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal")
+        axis.legend(fontsize=7, loc="upper left")
+        axis.grid(color="0.92")
+    plots.save(figure, path, 80)
+
+
+def recorded() -> dict[str, tuple[list[Row], list[Row]]]:
+    """Return the records of searches and poses that there are, by the name of their column."""
+    read = {
+        name: tuple(records.read(records.RECORDS / file) for file in files) for name, files in RECORDS.items()
+    }
+    return {name: (searches, poses) for name, (searches, poses) in read.items() if searches}
+
+
 def page_tables() -> dict[str, str]:
     """Return the tables of the page, from the records."""
-
-    def column(search: str, poses: str) -> tuple[list[Row], list[Row]]:
-        return records.read(records.RECORDS / search), records.read(records.RECORDS / poses)
-
-    before, now = column(BEFORE, BEFORE_POSES), column(RECORD, POSES)
-    columns = {name: of for name, of in (("before", before), ("now", now)) if of[0]}
+    columns = recorded()
     return {
         "verdict": verdict_table({name: (of[0], "reporting") for name, of in columns.items()}),
         "calibration": calibration_table({name: (of[1], "reporting") for name, of in columns.items()}),
@@ -390,7 +423,7 @@ def main() -> None:
         cli.option("--draw", type=Path, metavar="DIR", help="a picture of each search: hits, misses, wrong"),
         cli.option("--save-poses", type=Path, metavar="DIR", help="scans, poses and what they are, as npz"),
         cli.flag("--docs", "write the record and the tables of docs/verdict.md"),
-        cli.option("--record", choices=("before", "now"), default="now", help="which column of the page"),
+        cli.option("--record", choices=tuple(RECORDS), default="now", help="which column of the page"),
     )
     if args.docs and (args.quick or args.half != "reporting" or args.no_low):
         args.error("--docs is for all scenes of the reporting half")
@@ -420,13 +453,16 @@ def main() -> None:
     show(f"\n{verdict_table({'measured': (rows, args.half)})}\n")
     show(calibration_table({"measured": (poses, args.half)}))
     if args.docs:
-        names = (BEFORE, BEFORE_POSES) if args.record == "before" else (RECORD, POSES)
-        for record, new, columns in zip(names, (rows, poses), (COLUMNS, POSE_COLUMNS), strict=True):
-            # Rows that were not run this time are kept.
-            regimes = {row["regime"] for row in rows}
-            old = [row for row in records.read(records.RECORDS / record) if row["regime"] not in regimes]
-            records.write(records.RECORDS, record, old + new, columns)
+        # Rows that were not run this time are kept.
+        regimes = {row["regime"] for row in rows}
+        for file, new, columns in zip(
+            RECORDS[args.record], (rows, poses), (COLUMNS, POSE_COLUMNS), strict=True
+        ):
+            old = [row for row in records.read(records.RECORDS / file) if row["regime"] not in regimes]
+            records.write(records.RECORDS, file, old + new, columns)
         records.fill(PAGE, page_tables())
+        pictured = {name: (of[1], "reporting") for name, of in recorded().items()}
+        draw_reliability(pictured, records.FIGURES / PICTURE)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,9 @@
 
 `outlier_layout` mixes true pairs with random outliers; `ecc_layout` matches noisy descriptors of clean
 shapes: your own, or FPFH; `fpfh_layout` matches FPFH of the target as it is. Lengths are in radii of the
-source shape, which lies in the unit sphere. `pile_scene` gives no correspondences but the scan of a heap, in
-the unit of its mesh. FPFH and piles need Open3D (``pip install 'ibi_rs[open3d]'``).
+source shape, which lies in the unit sphere. The others give no correspondences but scans, in the unit of the
+meshes: `pile_scene` of a heap, `bin_scene` and `row_scene` of a bin, `room_scene` of a room; `part_mesh` and
+`furniture_mesh` give meshes for them. FPFH and scans need Open3D (``pip install 'ibi_rs[open3d]'``).
 This package imports nothing else of `ibi_rs`.
 
 Examples
