@@ -52,7 +52,7 @@ def _outline(
     flat, _ = place(moved)  # type: ignore[operator]
     axis.scatter(*flat.T, c=color, s=1.2, linewidths=0, alpha=0.6)  # type: ignore[attr-defined]
     if text:
-        axis.text(*flat.mean(axis=0), text, fontsize=6, color="white", ha="center")  # type: ignore[attr-defined]
+        axis.text(*flat.mean(axis=0), text, fontsize=6, ha="center")  # type: ignore[attr-defined]
 
 
 def _from_eye(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
