@@ -31,6 +31,8 @@ VISIBLE = 0.5
 """Least share of the silhouette that an instance must show to be asked for."""
 VISIBLE_SURFACE = 0.3
 """In rooms, of the surface: a camera that sees all of a silhouette sees about half of the surface."""
+NUM_DENSE, ALIKE = 12_000, 0.01
+"""Points of a surface, and how far it may be off for a turn to be a symmetry, diameters."""
 BOX_FRAMES = {
     "tuning": ("00020", "00024", "00028", "00009"),
     "reporting": ("00022", "00026", "00000"),
@@ -379,6 +381,16 @@ def outlier_scenes(half: Half, quick: bool) -> Iterator[synth.Scene]:
         yield synth.outlier_layout(FIRST_SEED[half] + i, shape=cloud, true_pairs=10, num_correspondences=5000)
 
 
+def symmetries(mesh: Mesh, to_middle: NDArray[np.float64]) -> ibi.Symmetries:
+    """Return what leaves a part looking the same, about its middle.
+
+    From points that are denser than those of the model, which cannot tell a box of 44 x 52 from a square one.
+    """
+    points, normals = ibi.features.sample_mesh(*mesh, n=NUM_DENSE)
+    seen = ibi.features.outer_surface(points, normals, *mesh)
+    return ibi.find_symmetries(points[seen] - to_middle[:3, 3], normals[seen], tolerance=ALIKE)
+
+
 class Models:
     """Models of searches, each made once, with their symmetries about their middle where there is a truth."""
 
@@ -393,6 +405,6 @@ class Models:
             model = ibi.Model.from_mesh(*search.mesh)
             found = ibi.Symmetries.none()
             if len(search.poses):
-                found = ibi.find_symmetries(centred(model)[0], model.normals)
+                found = symmetries(search.mesh, centred(model)[1])
             self._held[key] = corners, model, found
         return self._held[key][1:]

@@ -25,7 +25,7 @@ NO_OPEN3D = "large, so not in the group of the tests: `make test-all` installs i
 needs_open3d = pytest.mark.skipif(open3d is None, reason=NO_OPEN3D)
 ROOT = Path(__file__).parents[1]
 MODEL = ibi.Model.from_mesh(*synth.part_mesh("carton-a"))
-SYMMETRIES = ibi.find_symmetries(centred(MODEL)[0], MODEL.normals)
+SYMMETRIES = verdict_searches.symmetries(synth.part_mesh("carton-a"), centred(MODEL)[1])
 POSES = np.tile(np.eye(4), (3, 1, 1))
 POSES[:, 0, 3] = 0, 200, 400
 VISIBILITY = np.array([1.0, 0.5, 0.49])
@@ -93,6 +93,29 @@ def test_strict_is_modulo_symmetry():
     # A millimetre in metres.
     one = judge([found[1]], POSES, VISIBILITY, MODEL, SYMMETRIES, visible=0.5, mm=1e-3)
     assert one.is_strict.tolist() == [False]
+
+
+@pytest.mark.parametrize(
+    ("name", "discrete", "axes"),
+    [
+        ("carton-a", 4, 0),
+        ("cube-a", 24, 0),
+        ("bracket-b", 1, 0),
+        ("clip-a", 1, 0),
+        ("rod-a", 2, 1),
+        ("bolt-a", 6, 0),
+    ],
+)
+def test_symmetries_are_told_from_what_is_nearly_one(name, discrete, axes):
+    mesh = synth.part_mesh(name)
+    found = verdict_searches.symmetries(mesh, centred(ibi.Model.from_mesh(*mesh))[1])
+    assert (len(found.discrete), len(found.continuous)) == (discrete, axes)
+
+
+def test_a_nearly_square_box_is_not_square():
+    box = synth.part_mesh("cube-a")[0] / 30 * [232, 44, 52], synth.part_mesh("cube-a")[1]
+    found = verdict_searches.symmetries(box, centred(ibi.Model.from_mesh(*box))[1])
+    assert len(found.discrete) == 4
 
 
 def test_where_labels_are_missing_the_rest_is_unknown():
