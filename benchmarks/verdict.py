@@ -425,7 +425,7 @@ def main() -> None:
         cli.flag("--docs", "write the record and the tables of docs/verdict.md"),
         cli.option("--record", choices=tuple(RECORDS), default="now", help="which column of the page"),
     )
-    if args.docs and (args.quick or args.half != "reporting" or args.no_low):
+    if args.docs and (args.quick or args.half != "reporting"):
         args.error("--docs is for all scenes of the reporting half")
     cli.machine(f"{args.half} half", "quick" if args.quick else "all scenes")
     chosen = args.rows or (*ROWS, OUTLIERS)

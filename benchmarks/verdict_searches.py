@@ -373,12 +373,14 @@ ROWS: dict[str, Callable[[Half, bool], Iterator[Search]]] = {
 
 
 def outlier_scenes(half: Half, quick: bool) -> Iterator[synth.Scene]:
-    """Make scenes in which each instance has 10 right pairs of 5000."""
+    """Make scenes of five instances, each with 10 right pairs of 5000: more would help to find the rest."""
     clouds = shapes("plain", half)
     names = list(clouds)
-    for i in range(fewer(quick, 10, 2)):
+    for i in range(fewer(quick, 20, 2)):
         cloud = clouds[names[i % len(names)]][0]
-        yield synth.outlier_layout(FIRST_SEED[half] + i, shape=cloud, true_pairs=10, num_correspondences=5000)
+        yield synth.outlier_layout(
+            FIRST_SEED[half] + i, shape=cloud, true_pairs=10, num_correspondences=5000, num_instances=5
+        )
 
 
 def symmetries(mesh: Mesh, to_middle: NDArray[np.float64]) -> ibi.Symmetries:

@@ -270,7 +270,7 @@ def test_a_quick_run_prints_saves_and_draws(tmp_path, monkeypatch, capsys):
 
 
 def test_the_record_is_of_the_reporting_half(monkeypatch):
-    for more in (["--half", "tuning"], ["--quick"], ["--no-low"]):
+    for more in (["--half", "tuning"], ["--quick"]):
         monkeypatch.setattr(sys, "argv", ["verdict.py", "--docs", *more])
         with pytest.raises(SystemExit):
             verdict.main()
