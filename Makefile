@@ -93,6 +93,10 @@ bench-detect: $(STAMPS)/package $(STAMPS)/group-test ## from mesh and scan to po
 bench-piles: $(STAMPS)/package $(STAMPS)/group-test $(STAMPS)/open3d peers pcl ## detect in ray-cast piles, beside PCL and OpenCV; ARGS=--docs records (needs Open3D)
 	$(BIN)/python benchmarks/piles.py $(ARGS)
 
+.PHONY: bench-verdict
+bench-verdict: $(STAMPS)/package $(STAMPS)/open3d ## whether scores are true in bins, rows, rooms, on real scans; ARGS=--quick, --docs records (needs Open3D)
+	$(BIN)/python benchmarks/verdict.py $(ARGS)
+
 .PHONY: bench-speed
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py

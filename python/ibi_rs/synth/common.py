@@ -24,6 +24,9 @@ class Layout(IntEnum):
     OUTLIER = 2
     FPFH = 3
     PILE = 4
+    BIN = 5
+    ROWS = 6
+    ROOM = 7
 
 
 class Purpose(IntEnum):

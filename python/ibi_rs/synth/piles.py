@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
+from .casting import Ground, Solids, checked_mesh, looking_at, sides
 from .common import Layout, Purpose, random_poses, stream
 from .descriptors import load_open3d
 from .scene import Array, move
@@ -141,7 +141,7 @@ def pile_scene(
         )
     if not 0 <= lo <= hi <= 60:
         raise ValueError(f"tilt_deg must be a range in order within [0, 60], got {tilt_deg}")
-    points, triangles = _mesh(vertices, faces)
+    points, triangles = checked_mesh(vertices, faces)
     load_open3d("Piles need")
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     voxel = size / _VOXELS_PER_DIAMETER
@@ -151,7 +151,7 @@ def pile_scene(
     corners = np.concatenate([move(pose, points) for pose in world_from_model])
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     tilt, azimuth = np.radians(draw.uniform(lo, hi)), draw.uniform(0, 2 * np.pi)
-    camera_from_world = _camera(middle, tilt, azimuth, distance * size)
+    camera_from_world = looking_at(middle, tilt, azimuth, distance * size)
     poses = camera_from_world @ world_from_model
     table = np.append(camera_from_world[:3, 2], -camera_from_world[:3, 2] @ camera_from_world[:3, 3])
 
@@ -187,22 +187,6 @@ def pile_scene(
     )
 
 
-def _mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-    """Check a mesh, and drop the vertices that no face uses: they would count in the bounding box."""
-    points, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
-    if points.shape[1:] != (3,) or not np.isfinite(points).all():
-        raise ValueError("vertices must be a (V, 3) array of finite numbers")
-    if triangles.shape[1:] != (3,) or not triangles.size or triangles.dtype.kind not in "iu":
-        raise ValueError("faces must be an (F, 3) array of integers, at least one row")
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise ValueError(f"faces must be rows of the {len(points)} vertices")
-    used, rows = np.unique(triangles, return_inverse=True)
-    points = points[used]
-    if not np.ptp(points, axis=0).any():
-        raise ValueError("the mesh has no extent")
-    return points, rows.reshape(-1, 3)
-
-
 # The heap, in the frame of the table: z up, the table is z = 0 ----------------------------------------------
 
 
@@ -215,66 +199,24 @@ def _heap(
     # Turned about the middle of its box, an instance lies within size / 2 of its place.
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     poses = random_poses(num_instances, rng, 0.0)
-    sides = [_sides((points - middle) @ pose[:3, :3].T, triangles, cell) for pose in poses]
-    area = sum(np.isfinite(upper).sum() for _, _, upper in sides) * cell**2
+    maps = [sides((points - middle) @ pose[:3, :3].T, triangles, cell) for pose in poses]
+    area = sum(np.isfinite(upper).sum() for _, _, upper in maps) * cell**2
     reach = math.sqrt(area / (np.pi * layers))
 
-    half = math.ceil((reach + size) / cell) + 2
-    top = np.zeros((2 * half, 2 * half))
-    for pose, (first, under, upper) in zip(poses, sides, strict=True):
+    ground = Ground(math.ceil((reach + size) / cell) + 2)
+    for pose, (first, under, upper) in zip(poses, maps, strict=True):
         radius, angle = reach * np.sqrt(rng.random(_PLACES)), rng.uniform(0, 2 * np.pi, _PLACES)
         places = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
         # Whole cells, so that the maps of the instance and of the heap have the same ones.
         cells = np.round(places / cell).astype(np.int64)
-        parts = [top[i : i + under.shape[0], j : j + under.shape[1]] for i, j in half + first + cells]
-        heights = [float(np.max(part - under)) for part in parts]
+        heights = [ground.rest(first + place, under) for place in cells]
         best = int(np.argmin(heights))
-        np.maximum(parts[best], upper + heights[best], out=parts[best])
+        ground.add(first + cells[best], upper, heights[best])
         pose[:3, 3] = np.append(cells[best] * cell, heights[best]) - pose[:3, :3] @ middle
     return poses
 
 
-def _sides(
-    points: Array, triangles: NDArray[np.int64], cell: float
-) -> tuple[NDArray[np.int64], Array, Array]:
-    """Height maps of a turned mesh: its first cell, its underside (inf where it has none), its top (-inf).
-
-    A cell's rim may hang lower than its middle, where the ray is cast, so the underside of a cell is that of
-    the lowest of the nine about it.
-    """
-    first = np.floor(points[:, :2].min(axis=0) / cell).astype(np.int64) - 1
-    last = np.floor(points[:, :2].max(axis=0) / cell).astype(np.int64) + 1
-    x, y = (np.arange(lo, hi + 1) + 0.5 for lo, hi in zip(first, last, strict=True))
-    places = np.stack(np.broadcast_arrays(x[:, None] * cell, y * cell), axis=-1)
-    below, above = points[:, 2].min() - cell, points[:, 2].max() + cell
-    heights = []
-    for start, way in ((below, 1.0), (above, -1.0)):
-        rays = np.zeros((*places.shape[:2], 6))
-        rays[..., :2], rays[..., 2], rays[..., 5] = places, start, way
-        t, _ = _cast([points], triangles, rays)
-        heights.append(start + way * t)
-    # A mesh so thin that all rays miss it would fall through the table.
-    rows = tuple((np.floor(points[:, :2] / cell).astype(np.int64) - first).T)
-    np.minimum.at(heights[0], rows, points[:, 2])
-    np.maximum.at(heights[1], rows, points[:, 2])
-    padded = np.pad(heights[0], 1, constant_values=np.inf)
-    n, m = heights[0].shape
-    lowest = np.min([padded[i : i + n, j : j + m] for i in range(3) for j in range(3)], axis=0)
-    return first, lowest, heights[1]
-
-
 # The view ---------------------------------------------------------------------------------------------------
-
-
-def _camera(middle: Array, tilt: float, azimuth: float, distance: float) -> Array:
-    """Return camera_from_world of a camera that looks at the middle; its x axis is level."""
-    cos, sin = np.cos(azimuth), np.sin(azimuth)
-    forward = -np.array([np.sin(tilt) * cos, np.sin(tilt) * sin, np.cos(tilt)])
-    right = np.array([-sin, cos, 0.0])
-    pose = np.eye(4)
-    pose[:3, :3] = right, np.cross(forward, right), forward
-    pose[:3, 3] = [0, 0, distance] - pose[:3, :3] @ middle
-    return pose
 
 
 def _view(
@@ -282,7 +224,7 @@ def _view(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Depth along each ray (NaN: nothing), and the instance it ends on (-1: none)."""
     from_camera = np.concatenate([np.zeros_like(rays), rays], axis=-1)
-    depth, owner = _cast([move(pose, points) for pose in poses], triangles, from_camera)
+    depth, owner = Solids([(move(pose, points), triangles) for pose in poses]).cast(from_camera)
     # Rays go down to the table, or else miss it.
     down = rays @ table[:3]
     with np.errstate(divide="ignore"):
@@ -290,17 +232,3 @@ def _view(
     is_table = of_table < depth
     depth = np.where(is_table, of_table, depth)
     return np.where(np.isfinite(depth), depth, np.nan), np.where(is_table, -1, owner)
-
-
-def _cast(meshes: list[Array], triangles: NDArray[np.int64], rays: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Length of each ray to the first mesh it meets (inf: none), in multiples of its direction, and which."""
-    o3d: Any = load_open3d("Piles need")
-    scene = o3d.t.geometry.RaycastingScene()
-    for points in meshes:
-        scene.add_triangles(
-            o3d.core.Tensor(points.astype(np.float32)), o3d.core.Tensor(triangles.astype(np.uint32))
-        )
-    answer = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
-    t = answer["t_hit"].numpy().astype(np.float64)
-    owner = answer["geometry_ids"].numpy().astype(np.int64)
-    return t, np.where(np.isfinite(t), owner, -1)
