@@ -238,8 +238,8 @@ impl<'a> Registrar<'a> {
             );
             let pairs = pairs?;
             let scene = Scene::new(clouds, near?, measured, tolerances, &interrupt)?;
-            let measured = measured.unwrap_or(&scene.target.points);
-            let closeup = Closeup::new(&scene, measured, &interrupt);
+            // Where nothing more was measured than the target there is nothing more to look at.
+            let closeup = measured.and_then(|measured| Closeup::new(&scene, measured, &interrupt));
             Ok::<_, Error>((scene, pairs, closeup))
         })?;
         Ok(State::new(Problem::new(scene, pairs, closeup, interrupt), Arc::clone(pool), start))
