@@ -1,0 +1,109 @@
+"""Fit the weights of a close look (`SHARP` of odds.rs in the core) on the tuning half of verdict.py.
+
+IBI_DATA=... python benchmarks/verdict_fit.py
+
+Each search gives the poses on which it was decided: those returned and those rejected. Right are those that
+are one to one with a truth. Others near the same truth are left out, and so are poses that are nearly right,
+and models of nearly the right size: neither answer would be wrong. Where a scan is blurred other weights hold,
+which are not fitted here.
+"""
+
+from collections.abc import Iterator
+
+import ibi_rs as ibi
+import numpy as np
+from frame import cli, tables
+from frame.tables import show
+from scipy.optimize import minimize
+from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW, judge
+from verdict_searches import ROWS, Models, Search
+
+TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness")
+NOISE = 0.12, 0.24
+"""As in odds.rs: sharp up to the first, blurred from the second on, voxels."""
+NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
+REGIMES = ("boxes", "scans", "bins", "rows", "mirror", "sizes", "absent")
+POWER = 0.7
+"""A class of n poses in a regime weighs n to 1 minus this."""
+
+
+def terms(of: ibi.Measures) -> list[float]:
+    """Return what `Measures::log_odds` weighs in a sharp scan."""
+    known = of.supported + of.contradicted + of.buried
+    ends = of.runs_on + of.ends
+    held = np.sqrt(np.clip(of.losses, 0, 1))
+    return [
+        1.0,
+        min(of.contradicted / (known + 20), 0.3),
+        (of.runs_on - 0.5 * ends) / (ends + 15),
+        min(of.beyond / (of.on + 20), 0.2),
+        held[1],
+        held[2],
+        float(np.clip(of.closeness, -0.5, 1.1)),
+    ]
+
+
+def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]]:
+    """Search, and return the terms of each pose with whether it is right."""
+    model, symmetries = models.of(search)
+    found = model.detect(search.scan.points, **search.scan.told)
+    all_ = [*found, *found.rejected]
+    poses = np.array([pose.target_from_source for pose in all_]).reshape(-1, 4, 4)
+    judgement = judge(
+        poses,
+        search.poses,
+        search.visibility,
+        model,
+        symmetries,
+        visible=search.visible,
+        mm=search.mm,
+        is_complete=search.is_complete,
+    )
+    for pose, state, distance in zip(all_, judgement.states, judgement.distances, strict=True):
+        is_right = state in (RIGHT, HIDDEN)
+        is_other = distance < RIGHT_BELOW and not is_right
+        is_nearly = search.scale == 1 and NEARLY[0] < distance < NEARLY[1]
+        if pose.measures is not None and pose.measures.noise < NOISE[1] and not is_other and not is_nearly:
+            yield terms(pose.measures), is_right
+
+
+def main() -> None:
+    """Collect, fit, print."""
+    args = cli.parse(__doc__, cli.flag("--quick", "one or two scenes of each kind"))
+    models = Models()
+    rows: list[tuple[str, list[float], bool]] = []
+    for regime in REGIMES:
+        for search in ROWS[regime]("tuning", args.quick):
+            is_nearly_size = search.scale != 1 and 0.85 < search.scale < 1.15
+            if search.scan.half == "tuning" and "viewpoint" in search.scan.told and not is_nearly_size:
+                rows += [(regime, *pose) for pose in decided(search, models)]
+    of, right = np.array([row[1] for row in rows]), np.array([row[2] for row in rows], dtype=float)
+    regimes = np.array([row[0] for row in rows])
+    weight = np.zeros(len(rows))
+    for regime in set(regimes):
+        for answer in (0, 1):
+            of_class = (regimes == regime) & (right == answer)
+            weight[of_class] = of_class.sum() ** -POWER if of_class.any() else 0.0
+    spread = np.r_[1.0, of[:, 1:].std(axis=0)]
+
+    def loss(b: np.ndarray) -> float:
+        odds = of / spread @ b
+        return float(
+            np.average(np.logaddexp(0, odds) - right * odds, weights=weight) + 1.5e-3 * b[1:] @ b[1:]
+        )
+
+    weights = minimize(loss, np.zeros(len(TERMS)), method="L-BFGS-B").x / spread
+    show(tables.markdown(TERMS, [[f"{w:.2f}" for w in weights]]))
+    accepted = of @ weights > 0
+    lines = []
+    for regime in REGIMES:
+        ours = regimes == regime
+        hits = int((accepted & ours & (right > 0)).sum())
+        lines.append(
+            (regime, f"{hits} of {int(accepted[ours].sum())}", f"{hits} of {int(right[ours].sum())}")
+        )
+    show(tables.markdown(("regime", "right of accepted", "accepted of right"), lines))
+
+
+if __name__ == "__main__":
+    main()
