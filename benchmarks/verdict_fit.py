@@ -4,8 +4,8 @@ IBI_DATA=... python benchmarks/verdict_fit.py
 
 Each search gives the poses on which it was decided: those returned and those rejected. Right are those that
 are one to one with a truth. Others near the same truth are left out, and so are poses that are nearly right,
-and models of nearly the right size: neither answer would be wrong. Where a scan is blurred other weights hold,
-which are not fitted here.
+and models of nearly the right size: neither answer would be wrong. Where a scan is blurred other weights
+hold, which are not fitted here.
 """
 
 from collections.abc import Iterator
@@ -19,8 +19,8 @@ from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW, judge
 from verdict_searches import ROWS, Models, Search
 
 TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness")
-NOISE = 0.12, 0.24
-"""As in odds.rs: sharp up to the first, blurred from the second on, voxels."""
+SHARP = 0.12
+"""As in odds.rs: the noise up to which a scan is sharp, voxels."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
 REGIMES = ("boxes", "scans", "bins", "rows", "mirror", "sizes", "absent")
 POWER = 0.7
@@ -63,7 +63,7 @@ def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]
         is_right = state in (RIGHT, HIDDEN)
         is_other = distance < RIGHT_BELOW and not is_right
         is_nearly = search.scale == 1 and NEARLY[0] < distance < NEARLY[1]
-        if pose.measures is not None and pose.measures.noise < NOISE[1] and not is_other and not is_nearly:
+        if pose.measures is not None and pose.measures.noise < SHARP and not is_other and not is_nearly:
             yield terms(pose.measures), is_right
 
 

@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
 
 use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
 use super::noise::noise_of_rays;
-use super::odds::Measures;
+use super::odds::{BLURRED, Measures};
 use super::rays::Rays;
 use super::seen::{Look, Seen, Tally, Tolerance, faces, look, merge};
 use super::settle::{Steps, settle};
@@ -65,7 +65,8 @@ struct At {
 }
 
 impl Closeup {
-    /// Of what was `measured` from the viewpoint of a scene with oriented normals. `None` for others, or if interrupted.
+    /// Of what was `measured` from the viewpoint of a scene with oriented normals. `None` for others, where the noise blurs what is
+    /// to be told apart, or if interrupted.
     pub(crate) fn new(scene: &Scene<'_>, measured: &[Point3<f64>], interrupt: &Interrupt) -> Option<Self> {
         let normals = scene.source.normals.as_ref().filter(|_| scene.is_one_sided())?;
         let rays = vec![Rays::new(scene.target.viewpoint?, measured)?];
@@ -73,7 +74,11 @@ impl Closeup {
             return None;
         }
         let voxel = VOXELS_PER_SPACING * scene.resolution;
-        let noise = noise_of_rays(&rays[0], measured);
+        // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
+        let noise = noise_of_rays(&rays[0], &scene.target.points);
+        if noise >= BLURRED * voxel {
+            return None;
+        }
         let tolerance = Tolerance::of(voxel, noise);
         let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
         let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);

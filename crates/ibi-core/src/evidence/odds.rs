@@ -2,6 +2,7 @@
 
 use super::contour::{Contour, Overrun};
 use super::seen::Tally;
+use super::support::ONE_SIDED;
 
 /// What was measured of a pose.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -42,12 +43,11 @@ const CLOSENESS: [f64; 2] = [-0.5, 1.1];
 /// decided on them; `benchmarks/verdict_fit.py` fits them anew. The least loss told nothing beside the others.
 const SHARP: [f64; 7] = [-2.48, -5.5, -3.18, -37.9, 2.7, 0.23, 2.22];
 
-/// The same where the noise is as large as what is to be told apart: then what the clouds say ([`super::Support`]) holds, and what
-/// runs on or lies beyond a part speaks against it.
-const BLURRED: [f64; 5] = [-4.6, -6.0, -37.0, 0.05, 9.7];
-
-/// Standard deviations of the noise, voxels: up to the first a scan is sharp, from the second on it is blurred.
-const NOISE: [f64; 2] = [0.12, 0.24];
+/// Standard deviations of the noise, voxels: up to the first a scan is sharp, and from the second on a close look tells no more than
+/// the clouds; in between it counts in proportion. In the middle of the two, two and a half deviations are as much as a pose is
+/// known to before it is settled.
+const NOISE: [f64; 2] = [0.12, BLURRED];
+pub(super) const BLURRED: f64 = 0.2;
 
 /// Of a loss the root: the step from none to a little tells most.
 fn held(loss: f64) -> f64 {
@@ -77,11 +77,11 @@ impl Measures {
         let closeness = self.closeness.clamp(CLOSENESS[0], CLOSENESS[1]);
         let [_, second, third] = self.losses.map(held);
         let sharp = [1.0, contradicted, runs_on, beyond, second, third, closeness];
-        let blurred = [1.0, runs_on, beyond, self.evidence.ln_1p(), self.closeness];
+        let blurred = [1.0, self.evidence.ln_1p(), self.closeness];
         let blur = ((self.noise - NOISE[0]) / (NOISE[1] - NOISE[0])).clamp(0.0, 1.0);
         let weighed =
             |terms: &[f64], weights: &[f64]| -> f64 { terms.iter().zip(weights).map(|(a, b)| a * b).sum() };
-        (1.0 - blur) * weighed(&sharp, &SHARP) + blur * weighed(&blurred, &BLURRED)
+        (1.0 - blur) * weighed(&sharp, &SHARP) + blur * weighed(&blurred, &ONE_SIDED)
     }
 
     /// The probability that the pose is right.

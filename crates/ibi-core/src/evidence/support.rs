@@ -97,4 +97,4 @@ const WHOLE: [f64; 4] = [-26.8, 1.27, 17.45, 18.75];
 /// in ray-cast piles, real scans, and scans of another part; these weights are more cautious than its `--fit`, for those
 /// who look for a part that may not be there. Correspondences hardly count: a part found the wrong way round has as many
 /// as the right pose.
-const ONE_SIDED: [f64; 4] = [-5.1, 0.05, 9.7, 0.0];
+pub(super) const ONE_SIDED: [f64; 4] = [-5.1, 0.05, 9.7, 0.0];
