@@ -14,7 +14,7 @@ from ibi_rs._ray import RayExecutor
 from ibi_rs._register import register
 from ibi_rs._view import View
 from ibi_rs.params import Params
-from ibi_rs.registration import Pose, Registration, Round, StopReason, Timings, Verdict
+from ibi_rs.registration import Measures, Pose, Registration, Rejected, Round, StopReason, Timings, Verdict
 from ibi_rs.symmetries import Symmetries, find_symmetries
 from ibi_rs.variants import (
     Evidence,
@@ -46,6 +46,7 @@ __all__ = [
     "JobError",
     "LocalGtm",
     "Mac",
+    "Measures",
     "Matches",
     "Model",
     "Nnsr",
@@ -58,6 +59,7 @@ __all__ = [
     "Ransac",
     "RayExecutor",
     "Registration",
+    "Rejected",
     "Round",
     "SacCot",
     "StopReason",

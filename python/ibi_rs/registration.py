@@ -24,15 +24,16 @@ class Measures:
     Attributes
     ----------
     supported, contradicted, buried, hidden, unknown : int
-        Model points that the camera could see: measured where they should be; looked through; a little behind what
-        was measured; behind something else; where nothing was measured.
+        Model points that the camera could see: measured where they should be; looked through; a little
+        behind what was measured; behind something else; where nothing was measured.
     runs_on, ends : int
-        Places just beyond the ends of its faces where the scene goes on in the face's plane, and where it does not.
+        Places just beyond the ends of its faces where the scene goes on in the face's plane, and where it
+        does not.
     beyond, on : int
         Points of the thinned scan around it that carry its surface on, and points on it.
     losses : tuple of float
-        How much worse it fits when it is moved, by 1.5 voxels or more where the scan is noisy, along the three
-        motions that are held least: near 0 where nothing holds it.
+        How much worse it fits when it is moved, by 1.5 voxels or more where the scan is noisy, along the
+        three motions that are held least: near 0 where nothing holds it.
     noise : float
         Standard deviation of the scan across its surfaces, in voxels.
     closeness, evidence : float
@@ -56,9 +57,12 @@ class Measures:
     @classmethod
     def _of(cls, raw: dict[str, Any]) -> Measures:
         tally, contour, overrun = raw["tally"], raw["contour"], raw["overrun"]
-        seen = ("supported", "contradicted", "buried", "hidden", "unknown")
         return cls(
-            *(tally[name] for name in seen),
+            supported=tally["supported"],
+            contradicted=tally["contradicted"],
+            buried=tally["buried"],
+            hidden=tally["hidden"],
+            unknown=tally["unknown"],
             runs_on=contour["runs_on"],
             ends=contour["ends"],
             beyond=overrun["beyond"],
@@ -81,9 +85,9 @@ class Rejected:
     score : float
         The probability that it is right, 0 to 1.
     objection : str
-        What speaks most against it: ``contradicted`` (the camera looked through it), ``runs_on`` (the scene goes on where its faces should end), ``overrun`` (points around
-        it carry its surface on), ``slips`` (moved a little, it fits as well),
-        ``loose`` (its surface lies off what was measured).
+        What speaks most against it: ``contradicted`` (the camera looked through it), ``runs_on`` (the scene
+        goes on where its faces should end), ``overrun`` (points around it carry its surface on), ``slips``
+        (moved a little, it fits as well), ``loose`` (its surface lies off what was measured).
     round : int
         The round that found it.
     measures : Measures
@@ -128,7 +132,8 @@ class Pose:
     round : int
         The round that found it.
     measures : Measures or None
-        What was measured of it close up, where the scene is seen from one side and judged by :class:`Evidence`; the
+        What was measured of it close up, where the scene is seen from one side and judged by
+        :class:`Evidence`; the
         score is theirs then.
     """
 
@@ -372,7 +377,10 @@ class Registration(Sequence[Pose]):
         rejected = zip(raw["rejected_poses"], json.loads(raw["rejected"]), strict=True)
         return cls(
             list(map(Pose, *columns, measures)),
-            rejected=[Rejected(pose, *told, Measures._of(of)) for pose, (*told, of) in rejected],
+            rejected=[
+                Rejected(pose, score, objection, found_in, Measures._of(of))
+                for pose, (score, objection, found_in, of) in rejected
+            ],
             labels=raw["labels"],
             rounds=raw["rounds"],
             stop_reason=StopReason(message=raw["stop_message"], **json.loads(raw["stop_reason"])),

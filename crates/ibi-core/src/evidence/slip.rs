@@ -4,7 +4,7 @@
 //! the surface by n . (w x (p - c) + t). A motion that changes no distance is free: a slide on a plane, a turn about an axis
 //! (Gelfand & Ikemoto 2003).
 //!
-//! Motions are *left* perturbations in the target's frame, about a centre c: x -> c + exp([w]) (x - c) + t. Six numbers in this
+//! Motions are *left* perturbations in the target's frame, about a centre c: x -> c + exp(\[w\]) (x - c) + t. Six numbers in this
 //! order: w_x, w_y, w_z (radians), t_x, t_y, t_z (data units).
 
 use super::seen::{Look, Seen};

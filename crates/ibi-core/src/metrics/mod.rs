@@ -12,7 +12,7 @@
 //!
 //! A pose is an [`Isometry3`](nalgebra::Isometry3) and reads `target_from_source`: it moves the model into
 //! the scene. Poses and points are finite by contract; nothing here looks for NaN again.
-//! What can take long takes an [`Interrupt`](crate::Interrupt), and runs on the pool that it is called in.
+//! What can take long takes an [`Interrupt`], and runs on the pool that it is called in.
 //!
 //! # Examples
 //!
