@@ -148,12 +148,13 @@ impl<'a> State<'a> {
         let is_lean = self.rounds.last().is_some_and(|last| !last.accepted());
         let context = problem.context(stages.params, round, instances.poses());
         let mut asked = Asked { stages, tried, is_lean, timings: Timings::default() };
-        let barred = problem.also_barred(seeds.ids());
+        let looks_ahead = is_lean && stages.may_look_ahead(problem);
+        let barred = looks_ahead.then(|| problem.also_barred(seeds.ids()));
         let play = || stages_in_order(&mut asked, &context, seeds);
         let mut next = None;
-        let played = if is_lean && stages.may_look_ahead(problem) {
+        let played = if let Some(barred) = &barred {
             let context = problem.context(stages.params, round + 1, instances.poses());
-            let context = Context { barred: &barred, ..context };
+            let context = Context { barred, ..context };
             let (played, selected) = par::join(play, || stages.select_seeds(&context));
             next = Some(selected);
             played
