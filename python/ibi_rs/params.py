@@ -12,7 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
@@ -259,9 +259,15 @@ class Params:
         return _dumps(self._built_in())
 
 
+@cache
+def _default() -> Params:
+    """Make the default parameters once: to check them takes as long as a small scene's rounds."""
+    return Params()
+
+
 def _limited(params: Params | None, max_instances: int | None, timeout_s: float | None) -> Params:
     """Return the parameters of a run."""
-    params = Params() if params is None else params
+    params = _default() if params is None else params
     if not isinstance(params, Params):
         raise TypeError(f"params must be ibi_rs.Params, not {type(params).__name__}")
     overrides = {"max_instances": max_instances, "timeout_s": timeout_s}
