@@ -16,6 +16,7 @@ mod bodies;
 mod detect;
 mod doubts;
 mod error;
+mod extent;
 mod model;
 mod scan;
 mod sides;

@@ -3,7 +3,7 @@
 use nalgebra::{Point3, Vector3};
 
 use super::bodies::{Body, bodies};
-use super::doubts::extent;
+use super::extent::extent;
 use super::{DetectionError, VOXELS_PER_SPACING};
 use crate::error::{Argument, Error};
 use crate::features::{Neighborhood, Plane, PlaneSearch, dominant_plane, estimate_normals, voxel_downsample};

@@ -2,7 +2,6 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::seen::faces;
 use crate::kernels::grid::buckets;
 
 /// Points by the direction in which an eye saw them, all around it: six images, one to each side of a cube.
@@ -25,6 +24,16 @@ struct Side {
     /// From the eye to the points, cell by cell.
     ends: Vec<Vector3<f64>>,
     rows: Vec<u32>,
+}
+
+/// Least cosine between the normal of a point and the way to the eye: what is seen from its edge is measured badly or not at all.
+pub const MIN_FACING_COS: f64 = 0.15;
+
+/// Whether a surface is turned towards an eye enough to be measured.
+#[must_use]
+pub fn faces(eye: &Point3<f64>, at: &Point3<f64>, normal: &Vector3<f64>) -> bool {
+    let to_eye = eye - at;
+    normal.dot(&to_eye) > MIN_FACING_COS * to_eye.norm()
 }
 
 /// The widest angle about a direction in which rays are looked for, radians: for what is wider, it is too near.

@@ -2,7 +2,7 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::rays::Rays;
+use super::rays::{Rays, faces};
 
 /// What an eye says of a point on a surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -50,9 +50,6 @@ const ASIDE_RAYS: f64 = 1.5;
 
 /// What is less than so many tolerances behind what was measured is buried, and not hidden.
 const BURIED: f64 = 3.0;
-
-/// Least cosine between the normal of a point and the way to the eye: what is seen from its edge is measured badly or not at all.
-pub const MIN_FACING_COS: f64 = 0.15;
 
 /// What was measured where a surface should be.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -114,13 +111,6 @@ pub fn look(rays: &Rays, at: &Point3<f64>, normal: &Vector3<f64>, tolerance: Tol
         Seen::Hidden
     };
     Look { seen, gap: nearest, share: 0.0 }
-}
-
-/// Whether a surface is turned towards an eye enough to be measured.
-#[must_use]
-pub fn faces(eye: &Point3<f64>, at: &Point3<f64>, normal: &Vector3<f64>) -> bool {
-    let to_eye = eye - at;
-    normal.dot(&to_eye) > MIN_FACING_COS * to_eye.norm()
 }
 
 /// What an eye says of each point of a model that a pose has moved. `is_hidden` tells which of them the model itself hides from

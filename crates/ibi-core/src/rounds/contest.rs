@@ -4,82 +4,22 @@ use std::time::Instant;
 
 use nalgebra::Isometry3;
 
+use super::candidates::Candidate;
+use super::closely::Looked;
 use super::judge::Judged;
 use super::memory::Tried;
 use super::stages::Stages;
 use super::state::State;
-use crate::evidence::Proof;
 use crate::grace::Grace;
 use crate::interrupt::Phase;
 use crate::params::{Params, Removal};
 use crate::registration::Rejected;
-use crate::stages::{Context, Hypothesis, Verdict};
 
 /// A close look is worth so many others: it tries some tens of poses.
 const PROOF_LOOKS: usize = 64;
 
 /// A contest accepts nothing below this share of its best value.
 const MARGIN: f64 = 0.8;
-
-/// Who competes, and since when.
-#[derive(Debug, Default)]
-pub(crate) struct Contest {
-    pub(super) candidates: Vec<Candidate>,
-    /// What passed, and failed when it was looked at closely.
-    /// Each with the pose that passed; what is told of is where that settled.
-    pub(super) rejected: Vec<(Isometry3<f64>, Rejected)>,
-    num_rounds: u32,
-}
-
-/// A hypothesis that passed validation and waits for the end of the contest.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Candidate {
-    pub(super) hypothesis: Hypothesis,
-    pub(super) value: f64,
-    pub(super) round: u32,
-    /// How many instances had claimed their points when it was measured.
-    pub(super) measured_at: u32,
-    /// What a close look has found, if there was one.
-    pub(super) proof: Option<Proof>,
-}
-
-/// A hypothesis looked at as closely as can be.
-pub(super) struct Looked {
-    pub(super) hypothesis: Hypothesis,
-    pub(super) verdict: Verdict,
-    pub(super) proof: Option<Proof>,
-}
-
-impl Stages<'_> {
-    /// The hypothesis settled and judged on all that was measured or, where there is no more than the clouds, validated on those.
-    pub(super) fn look_closely(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Looked {
-        if self.looks_closely()
-            && let Some(proof) = context.proof(&hypothesis.target_from_source)
-            && let Some(verdict) = self.hv.verdict_of_closeup(proof.measures.log_odds(), proof.explained)
-        {
-            let hypothesis = Hypothesis { target_from_source: proof.target_from_source, ..*hypothesis };
-            return Looked { hypothesis, verdict, proof: Some(proof) };
-        }
-        Looked { hypothesis: *hypothesis, verdict: self.hv.validate(context, hypothesis), proof: None }
-    }
-
-    fn looks_closely(&self) -> bool {
-        self.hv.verdict_of_closeup(0.0, 0.0).is_some()
-    }
-}
-
-impl Contest {
-    /// Whether it has lasted long enough.
-    pub(super) fn is_due(&self, params: &Params) -> bool {
-        self.num_rounds >= params.n_contest
-    }
-
-    /// The row of the best candidate; of equals that of the earliest round.
-    pub(super) fn best(&self) -> Option<usize> {
-        let order = |a: &Candidate, b: &Candidate| a.value.total_cmp(&b.value).then(b.round.cmp(&a.round));
-        self.candidates.iter().enumerate().max_by(|(_, a), (_, b)| order(a, b)).map(|(at, _)| at)
-    }
-}
 
 impl State<'_> {
     /// Enters the pose of the round just booked, if it passed. Of two that are the same pose the better one stays; only one

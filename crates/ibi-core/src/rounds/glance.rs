@@ -2,7 +2,7 @@
 
 use super::judge::{Close, Judge, Judged, Polished};
 use super::memory::Tried;
-use super::stages::timed;
+use super::timed::timed;
 use crate::detail::Detail;
 use crate::registration::Timings;
 use crate::stages::{Context, Hypothesis};

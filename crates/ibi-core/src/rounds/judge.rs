@@ -1,6 +1,6 @@
 //! Judging an estimated pose: it is polished on the clouds, then validated.
 
-use super::stages::timed;
+use super::timed::timed;
 use crate::detail::Detail;
 use crate::interrupt::Phase;
 use crate::params::Refine;

@@ -5,7 +5,8 @@
 //! | `state` | what is alive, what was found, what happened; when a run ends; removal |
 //! | `stages` | asks the stages: each told to the watcher, timed, and not begun once the run is to end |
 //! | `judge` | polishes a pose and validates it |
-//! | `contest` | poses that passed wait for better ones of the same instance |
+//! | `candidates`, `contest` | poses that passed wait for better ones of the same instance |
+//! | `closely` | looks at a pose on all that was measured before it becomes an instance |
 //! | `turns` | tries a pose the other ways round before it becomes an instance |
 //! | `joint` | at the end all poses compete for the scene at once |
 //! | `ranking` | makes the result |
@@ -19,6 +20,8 @@
 //! | `glance` | a hopeless pose is not looked at closely | the same poses |
 
 mod ahead;
+mod candidates;
+mod closely;
 mod contest;
 mod glance;
 mod instances;
@@ -30,6 +33,7 @@ mod ranking;
 mod shortcuts;
 mod stages;
 mod state;
+mod timed;
 mod turns;
 
 pub(crate) use problem::Problem;

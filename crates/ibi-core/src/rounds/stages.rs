@@ -1,11 +1,10 @@
 //! The stages as a round asks them: each told to the watcher, timed, and not begun once the run is to end.
 
-use std::time::Instant;
-
 use super::glance::Glance;
 use super::judge::{Close, Judge, Judged};
 use super::memory::{Remembering, Tried};
 use super::shortcuts::Shortcuts;
+use super::timed::timed;
 use crate::interrupt::Phase;
 use crate::params::Params;
 use crate::registration::Timings;
@@ -68,12 +67,4 @@ impl Asked<'_> {
         let judge: &dyn Judge = if shortcuts.glance { &glance } else { &close };
         Remembering { tried, judge }.judge(context, &estimate.hypothesis?, &mut self.timings)
     }
-}
-
-/// Runs `job` and adds its seconds to `total_s`.
-pub(super) fn timed<T>(total_s: &mut f64, job: impl FnOnce() -> T) -> T {
-    let start = Instant::now();
-    let result = job();
-    *total_s += start.elapsed().as_secs_f64();
-    result
 }

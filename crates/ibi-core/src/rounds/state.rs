@@ -7,7 +7,7 @@ use std::time::Instant;
 use nalgebra::Isometry3;
 
 use super::ahead::Ahead;
-use super::contest::Contest;
+use super::candidates::Contest;
 use super::instances::Instances;
 use super::judge::Judged;
 use super::memory::Tried;

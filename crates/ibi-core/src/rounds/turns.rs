@@ -1,6 +1,7 @@
 //! Trying a pose the other ways round: parts that look alike from several sides are often found turned.
 
-use super::contest::{Candidate, Looked};
+use super::candidates::Candidate;
+use super::closely::Looked;
 use super::stages::Stages;
 use super::state::State;
 use crate::detail::Detail;

@@ -5,8 +5,8 @@ use std::f64::consts::{PI, TAU};
 use ibi_core::evidence::contour::{Contour, Overrun, Placed, Rim, Scan, contour, overrun, run_on};
 use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays};
 use ibi_core::evidence::odds::Measures;
-use ibi_core::evidence::rays::{MAX_ANGLE, Rays, visible};
-use ibi_core::evidence::seen::{Look, MIN_FACING_COS, Seen, Tally, Tolerance, look, merge, sight};
+use ibi_core::evidence::rays::{MAX_ANGLE, MIN_FACING_COS, Rays, visible};
+use ibi_core::evidence::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
 use ibi_core::evidence::settle::{Steps, settle};
 use ibi_core::evidence::slip::{
     FreeMotion, covariance, free_motions, information, losses, motion_between, moved, principal_motions,
