@@ -8,7 +8,7 @@ benchmarks/frame/layouts.py whose shapes have neither symmetries nor near-copies
 hit one to one, below 20 degrees and 0.5 radii. Wrong poses above 0.9 are listed, each with what it is.
 
 With --fit nothing is drawn: a logistic regression over the poses of the tuning half gives the weights that
-crates/ibi-core/src/kernels/evidence.rs turns evidence, closeness and back_fit into log odds with. Each layout
+crates/ibi-core/src/evidence/support.rs turns evidence, closeness and back_fit into log odds with. Each layout
 weighs the same; scenes of which each object has lost 30 to 60 % of its points to a plane are among them.
 """
 

@@ -8,7 +8,7 @@ benchmarks/piles.py, tuning half, on the real scans whose labels are complete, a
 part, where every pose is wrong. A pose is right by ADD-S below a tenth of the diameter, one to one.
 
 With --fit a logistic regression over these poses gives the weights of 1 and of the closeness that
-crates/ibi-core/src/kernels/evidence.rs has for scenes seen from one side; that of the evidence is kept small.
+crates/ibi-core/src/evidence/support.rs has for scenes seen from one side; that of the evidence is kept small.
 Poses of another part make 7 % of all there.
 """
 

@@ -31,7 +31,7 @@ from frame.records import Row
 from frame.scans import FOLDER
 from frame.tables import show
 from frame.timing import timed
-from verdict_metrics import HIDDEN, RIGHT, UNKNOWN, WRONG, Judgement, brier, calibration_error, judge
+from verdict_metrics import HIDDEN, RIGHT, UNKNOWN, WRONG, Judgement, brier, calibration_error
 from verdict_pictures import draw
 from verdict_searches import GAPS, KINDS, ROWS, SIZES, TAKES_EYES, Models, Search, outlier_scenes
 
@@ -123,16 +123,7 @@ def run(search: Search, how: str, models: Models) -> Done:
     seconds, found = timed(
         partial(model.detect, search.scan.points, params_of(search, how), **search.scan.told)
     )
-    judgement = judge(
-        found,
-        search.poses,
-        search.visibility,
-        model,
-        symmetries,
-        visible=search.visible,
-        mm=search.mm,
-        is_complete=search.is_complete,
-    )
+    judgement = search.judge(found, model, symmetries)
     return Done(search, how, model, found, judgement, seconds)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from frame import cli, tables
 from frame.tables import show
 from scipy.optimize import minimize
-from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW, judge
+from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW
 from verdict_searches import ROWS, Models, Search
 
 TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness")
@@ -49,16 +49,7 @@ def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]
     found = model.detect(search.scan.points, **search.scan.told)
     all_ = [*found, *found.rejected]
     poses = np.array([pose.target_from_source for pose in all_]).reshape(-1, 4, 4)
-    judgement = judge(
-        poses,
-        search.poses,
-        search.visibility,
-        model,
-        symmetries,
-        visible=search.visible,
-        mm=search.mm,
-        is_complete=search.is_complete,
-    )
+    judgement = search.judge(poses, model, symmetries)
     for pose, state, distance in zip(all_, judgement.states, judgement.distances, strict=True):
         is_right = state in (RIGHT, HIDDEN)
         is_other = distance < RIGHT_BELOW and not is_right

@@ -10,11 +10,12 @@ from typing import Any, Literal
 
 import ibi_rs as ibi
 import numpy as np
+import numpy.typing as npt
 from frame import scans
 from frame.layouts import FIRST_SEED, MODELS, shapes
 from ibi_rs import synth
 from numpy.typing import NDArray
-from verdict_metrics import centred
+from verdict_metrics import Judgement, centred, judge
 
 Half = Literal["tuning", "reporting"]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -96,6 +97,19 @@ class Search:
     visible: float = VISIBLE
     mm: float = 1.0
     is_complete: bool = True
+
+    def judge(self, found: npt.ArrayLike, model: ibi.Model, symmetries: ibi.Symmetries) -> Judgement:
+        """Hold poses against the truth."""
+        return judge(
+            found,
+            self.poses,
+            self.visibility,
+            model,
+            symmetries,
+            visible=self.visible,
+            mm=self.mm,
+            is_complete=self.is_complete,
+        )
 
 
 # Scans ----------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
 use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
 use super::noise::noise_of_rays;
 use super::odds::{BLURRED, Measures};
-use super::rays::{Rays, faces};
-use super::seen::{Look, Seen, Tally, Tolerance, look, merge};
+use super::rays::Rays;
+use super::seen::{Look, Seen, Tally, Tolerance, merge, sight};
 use super::settle::{Steps, settle};
 use super::slip::{information, losses, moved, principal_motions, worth};
 use crate::detail::Detail;
@@ -49,7 +49,7 @@ const ACROSS: f64 = 0.5;
 const ROUNDS: u32 = 6;
 
 /// To settle a pose, one in so many points of the source is looked at.
-const SETTLE_STEP: usize = 2;
+const SETTLED_BY: usize = 2;
 
 /// A pose that so few points support has nothing to be settled by.
 const FEW_SUPPORTED: usize = 6;
@@ -92,7 +92,7 @@ impl Closeup {
         let across = ACROSS * tolerance.across;
         let steps = Steps { first: FIRST_STEP * voxel, least: LEAST_STEP * voxel, across, rounds: ROUNDS };
         let motions = |pose: &Isometry3<f64>| {
-            let at = self.at(scene, pose, SETTLE_STEP);
+            let at = self.at(scene, pose, SETTLED_BY);
             let information = information_of(scene, pose, &at);
             information.map_or_else(Vec::new, |(information, count)| {
                 let principal = principal_motions(&(information / count as f64), size);
@@ -140,7 +140,7 @@ impl Closeup {
 
     /// What a pose is worth, see [`worth`].
     fn worth(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> f64 {
-        let at = self.at(scene, pose, SETTLE_STEP);
+        let at = self.at(scene, pose, SETTLED_BY);
         let run_on: f64 =
             self.rays.iter().map(|rays| run_on(&self.rim, rays, at.placed(pose), self.tolerance)).sum();
         let is_asked = |row: &&u32| at.sight[**row as usize].seen != Seen::Away;
@@ -160,8 +160,8 @@ impl Closeup {
         Some(Scan { points: &scene.target.points, normals, nearby: &scene.near_target })
     }
 
-    /// Where a pose puts the source; one in so many of its points is looked at.
-    fn at(&self, scene: &Scene<'_>, pose: &Isometry3<f64>, step: usize) -> At {
+    /// Where a pose puts the source; one in `every` of its points is looked at.
+    fn at(&self, scene: &Scene<'_>, pose: &Isometry3<f64>, every: usize) -> At {
         let source = scene.source;
         let rotation = pose.rotation.to_rotation_matrix();
         let points: Vec<_> = source.points.iter().map(|p| rotation * p + pose.translation.vector).collect();
@@ -170,12 +170,7 @@ impl Closeup {
         for rays in &self.rays {
             let own = source.own_shadow(Detail::Look);
             let is_hidden = own.map_or(&[][..], |own| own.from(rays.eye(), pose));
-            let of = |(i, (at, normal)): (usize, (&Point3<f64>, &Vector3<f64>))| {
-                let is_shown = i % step == 0 && is_hidden.get(i) != Some(&true);
-                let is_asked = is_shown && faces(rays.eye(), at, normal);
-                if is_asked { look(rays, at, normal, self.tolerance) } else { Look::of(Seen::Away) }
-            };
-            let of_one: Vec<Look> = points.iter().zip(&normals).enumerate().map(of).collect();
+            let of_one = sight(rays, &points, &normals, is_hidden, every, self.tolerance);
             match &mut of_all {
                 None => of_all = Some(of_one),
                 Some(of_all) => merge(of_all, &of_one),

@@ -39,8 +39,9 @@ const MOST_BEYOND: f64 = 0.2;
 const CLOSENESS: [f64; 2] = [-0.5, 1.1];
 
 /// Weights of 1, contradicted, running on, beyond, the second and third loss, and closeness, where a scan is sharp: a logistic
-/// regression over the poses, right and wrong, of searches in the tuning half of `benchmarks/verdict.py`, as they stand when it is
-/// decided on them; `benchmarks/verdict_fit.py` fits them anew. The least loss told nothing beside the others.
+/// regression over the poses, right and wrong, of searches in the tuning half of `benchmarks/verdict.py`, as they stood when it was
+/// decided on them, in runs of 150 rounds without an instance; `benchmarks/verdict_fit.py` fits them anew, to the poses of today. The
+/// least loss told nothing beside the others.
 const SHARP: [f64; 7] = [-2.48, -5.5, -3.18, -37.9, 2.7, 0.23, 2.22];
 
 /// Standard deviations of the noise, voxels: up to the first a scan is sharp, and from the second on a close look tells no more than

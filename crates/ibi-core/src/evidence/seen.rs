@@ -114,7 +114,7 @@ pub fn look(rays: &Rays, at: &Point3<f64>, normal: &Vector3<f64>, tolerance: Tol
 }
 
 /// What an eye says of each point of a model that a pose has moved. `is_hidden` tells which of them the model itself hides from
-/// it; an empty one: none.
+/// it; an empty one: none. One in `every` points is asked for, the others are [`Seen::Away`].
 ///
 /// # Complexity
 /// O(points), times the rays that pass near each.
@@ -124,10 +124,11 @@ pub fn sight(
     points: &[Point3<f64>],
     normals: &[Vector3<f64>],
     is_hidden: &[bool],
+    every: usize,
     tolerance: Tolerance,
 ) -> Vec<Look> {
     let of = |(i, (at, normal)): (usize, (&Point3<f64>, &Vector3<f64>))| {
-        let is_away = is_hidden.get(i) == Some(&true) || !faces(rays.eye(), at, normal);
+        let is_away = i % every != 0 || is_hidden.get(i) == Some(&true) || !faces(rays.eye(), at, normal);
         if is_away { Look::of(Seen::Away) } else { look(rays, at, normal, tolerance) }
     };
     points.iter().zip(normals).enumerate().map(of).collect()

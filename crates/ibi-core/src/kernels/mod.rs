@@ -1,6 +1,6 @@
 //! The mathematics of the method, free of stages: pure functions, each with a naive twin in the tests.
 //!
-//! Public so that a stage of your own can be built from the same parts. Kernels trust their input (it was
+//! Public with the feature `internals` only, for this crate's own tests and benches. Kernels trust their input (it was
 //! checked at the door, see [`crate::Registrar::begin`]) and give the same bits for any number of threads.
 
 pub mod by_target;

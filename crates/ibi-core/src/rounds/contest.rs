@@ -10,6 +10,7 @@ use super::judge::Judged;
 use super::memory::Tried;
 use super::stages::Stages;
 use super::state::State;
+use crate::evidence::Proof;
 use crate::grace::Grace;
 use crate::interrupt::Phase;
 use crate::params::{Params, Removal};
@@ -137,16 +138,17 @@ impl State<'_> {
                         ..candidate
                     });
                 }
+                // Only a close look rejects here, and it tells why.
                 Some(Looked { hypothesis, proof, .. }) => {
-                    let measures = proof.map(|proof| proof.measures).unwrap_or_default();
-                    let rejected = Rejected {
+                    let rejected = proof.map(|Proof { measures, .. }| Rejected {
                         target_from_source: hypothesis.target_from_source,
                         score: measures.score(),
                         objection: measures.objection(),
                         measures,
                         round: candidate.round,
-                    };
-                    self.contest.rejected.push((candidate.hypothesis.target_from_source, rejected));
+                    });
+                    let passed = candidate.hypothesis.target_from_source;
+                    self.contest.rejected.extend(rejected.map(|rejected| (passed, rejected)));
                 }
             }
         }

@@ -218,7 +218,7 @@ fn points_that_are_turned_away_or_hidden_are_not_asked_for() {
     let at = Point3::new(0.0, 0.0, 2.0);
     let edge_on = Vector3::new(1.0, 0.0, -0.1).normalize();
     let normals = [-Vector3::z(), Vector3::z(), edge_on, -Vector3::z()];
-    let all = sight(&rays, &[at; 4], &normals, &[false, false, false, true], tolerance);
+    let all = sight(&rays, &[at; 4], &normals, &[false, false, false, true], 1, tolerance);
     let seen: Vec<_> = all.iter().map(|look| look.seen).collect();
     assert_eq!(seen, [Seen::Supported, Seen::Away, Seen::Away, Seen::Away]);
     let tally = Tally::of(&all);
@@ -381,7 +381,7 @@ impl Model {
 
     fn posed(&self, pose: &Isometry3<f64>, seeing: &Seeing) -> Posed {
         let (points, normals) = move_all(pose, &self.points, &self.normals);
-        let sight = sight(&seeing.rays, &points, &normals, &[], TOLERANCE);
+        let sight = sight(&seeing.rays, &points, &normals, &[], 1, TOLERANCE);
         Posed { pose: *pose, points, normals, sight }
     }
 
