@@ -31,14 +31,17 @@ help: ## list the targets
 demo: $(STAMPS)/package $(STAMPS)/group-demo ## register the example scenes and draw what was found
 	$(BIN)/python examples/demo.py
 
+# Built whole: what an incremental build keeps for the next one takes longer to write than it saves here.
+RUST_TESTS := CARGO_INCREMENTAL=0 cargo test --workspace --exclude ibi-py --exclude ibi-bench --all-features
+
 .PHONY: test
 test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and Python
-	cargo test --workspace --exclude ibi-py --exclude ibi-bench --all-features
-	$(BIN)/python -m pytest
+	$(RUST_TESTS)
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4
 
 .PHONY: test-all
 test-all: cargo $(STAMPS)/package $(STAMPS)/open3d $(STAMPS)/group-all ## the same with all that is optional, none skipped (installs Open3D, Dask, Ray, Rerun)
-	cargo test --workspace --exclude ibi-py --exclude ibi-bench --all-features
+	$(RUST_TESTS)
 	$(BIN)/python -m pytest --none-skipped
 
 .PHONY: test-clusters

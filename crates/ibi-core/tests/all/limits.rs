@@ -448,9 +448,9 @@ fn survivors(result: &Registration) -> Vec<u32> {
 #[test]
 fn the_joint_check_is_its_twin() {
     let mut num_dropped = HashSet::new();
-    // Of the last ones there are more than the ledger keeps of a row.
+    // Of the last one there are more than the ledger keeps of a row.
     let heaps = (0..12).map(|seed| (seed, 5 + 3 * seed as usize, 0.05 + 0.05 * seed as f64));
-    for (seed, num_poses, spread) in heaps.chain([(20, 300, 0.02), (21, 330, 0.1)]) {
+    for (seed, num_poses, spread) in heaps.chain([(20, 300, 0.02)]) {
         let (free, poses) = heaped(seed, num_poses, spread);
         let result = checked(&free, &poses, 1);
         assert_eq!(survivors(&result), naive_survivors(&free, &poses), "seed {seed}");
