@@ -62,7 +62,8 @@ impl Nearby {
     /// The same where most questions are within `usual`, which is no more than the reach.
     #[must_use]
     pub fn with_usual(points: &[Point3<f64>], reach: f64, usual: f64) -> Self {
-        let (grid, rows, bounds) = Self::sort(points, reach, usual);
+        let rows = columns(points, middle(points), reach);
+        let (grid, bounds) = Self::sort(&rows, reach, usual);
         let sorted = Sorted::new(&rows, grid);
         Self::of(points, [reach, usual], sorted, &rows, bounds, &|| false)
     }
@@ -77,7 +78,11 @@ impl Nearby {
         if interrupted() {
             return None;
         }
-        let (grid, rows, bounds) = Self::sort(points, reach, usual);
+        let rows = columns(points, middle(points), reach);
+        if interrupted() {
+            return None;
+        }
+        let (grid, bounds) = Self::sort(&rows, reach, usual);
         if interrupted() {
             return None;
         }
@@ -86,13 +91,12 @@ impl Nearby {
         (!interrupted()).then_some(nearby)
     }
 
-    /// The grid over some points, their columns, and the box around their bulk.
-    fn sort(points: &[Point3<f64>], reach: f64, usual: f64) -> (Grid, [Vec<f32>; 3], [(f32, f32); 3]) {
-        let rows = columns(points, middle(points), reach);
+    /// The grid over the columns of some points, and the box around their bulk.
+    fn sort(rows: &[Vec<f32>; 3], reach: f64, usual: f64) -> (Grid, [(f32, f32); 3]) {
         let bounds = rows.each_ref().map(|axis| bulk(axis));
         // The reach is 1. A cell and its neighbours hold what is usual, and the blocks of two cells an axis half of it for
         // sure.
-        (Grid::in_box(&rows, bounds, cell_of(reach, usual)), rows, bounds)
+        (Grid::in_box(rows, bounds, cell_of(reach, usual)), bounds)
     }
 
     fn of(

@@ -162,6 +162,7 @@ impl<'a> PreparedCloud<'a> {
         if let Some(rows) = &cloud.frames {
             check_frames(rows, frames, points.len(), argument)?;
         }
+        interrupt.proceed()?;
         let (centre, extent) = bounding_box(points);
         if extent <= 0.0 {
             return Err(Error::NoExtent { argument });
