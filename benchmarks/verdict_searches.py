@@ -20,7 +20,7 @@ from verdict_metrics import Judgement, centred, judge
 Half = Literal["tuning", "reporting"]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
-TAKES_EYES = False
+TAKES_EYES = True
 """Whether `Model.detect` takes all the eyes of a scan; if not, it is told one of them."""
 KINDS = ("bracket", "flange", "bolt", "clip", "pin")
 PIECES = ("chair", "table", "shelf")

@@ -137,6 +137,16 @@ def _viewpoint(value: Any) -> list[float]:
     return eye
 
 
+def _eyes(value: Any) -> npt.NDArray[np.float64]:
+    """(E, 3) float64, from one place or several."""
+    array = np.asarray(value)
+    if array.ndim != 2:
+        return np.array([_viewpoint(value)])
+    if len(array) == 0:
+        raise InputError("viewpoint has shape (0, 3); leave it out where none is known")
+    return _floats("viewpoint", value, "E", 3)
+
+
 def _correspondences(value: Any) -> npt.NDArray[Any]:
     """(M, 2) int64 rows or (M, 6) float64 points."""
     if isinstance(value, (tuple, list)) and len(value) == 2 and all(map(_is_rows3, value)):

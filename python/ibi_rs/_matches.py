@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ibi_rs import _precision
 from ibi_rs._inputs import Points, _num_threads, _scan_rows
-from ibi_rs._view import View, _camera
+from ibi_rs._view import Viewpoint, _cameras
 
 _Floats = npt.NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Matches(_Matched):
 def scan_arguments(
     tgt: Points,
     tgt_normals: npt.ArrayLike | None,
-    viewpoint: npt.ArrayLike | View | None,
+    viewpoint: Viewpoint | None,
     remove_plane: bool | None,
     check_units: bool,
     num_threads: int | None,
@@ -70,7 +70,7 @@ def scan_arguments(
         raise TypeError(f"remove_plane must be a bool or None, not {type(remove_plane).__name__}")
     points = _scan_rows("tgt", tgt)
     _precision.check_step("tgt", points)
-    eye, measured = _camera(viewpoint)
+    eye, measured = _cameras(viewpoint)
     return {
         "tgt": points,
         "tgt_normals": None if tgt_normals is None else _scan_rows("tgt_normals", tgt_normals),

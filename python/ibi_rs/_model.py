@@ -24,7 +24,7 @@ from ibi_rs._inputs import (
 )
 from ibi_rs._matches import Matches, scan_arguments
 from ibi_rs._numbers import significant
-from ibi_rs._view import View, _camera
+from ibi_rs._view import Viewpoint, _cameras
 from ibi_rs.params import Params, _limited
 from ibi_rs.registration import Registration, Round, on_round
 from ibi_rs.stages import own_stages
@@ -243,7 +243,7 @@ class Model:
         tgt: Points,
         *,
         tgt_normals: npt.ArrayLike | None = None,
-        viewpoint: npt.ArrayLike | View | None = None,
+        viewpoint: Viewpoint | None = None,
         remove_plane: bool | None = None,
         check_units: bool = True,
         num_threads: int | None = None,
@@ -271,7 +271,6 @@ class Model:
             Those of :meth:`detect`.
         """
         scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
-        scan.pop("measured")
         return Matches._of(_core.correspond(self._core, **scan))
 
     def detect(
@@ -280,7 +279,7 @@ class Model:
         params: Params | None = None,
         *,
         tgt_normals: npt.ArrayLike | None = None,
-        viewpoint: npt.ArrayLike | View | None = None,
+        viewpoint: Viewpoint | None = None,
         remove_plane: bool | None = None,
         check_units: bool = True,
         num_threads: int | None = None,
@@ -365,7 +364,7 @@ class Model:
         tgt_normals: npt.ArrayLike | None = None,
         tgt_frames: npt.ArrayLike | None = None,
         similarity: npt.ArrayLike | None = None,
-        viewpoint: npt.ArrayLike | View | None = None,
+        viewpoint: Viewpoint | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -376,7 +375,7 @@ class Model:
         Parameters, returns, raises: those of :func:`register`.
         """
         params = _limited(params, max_instances, timeout_s)
-        eye, measured = _camera(viewpoint)
+        eye, measured = _cameras(viewpoint)
         target, pairs = _points("tgt", tgt), _correspondences(corr)
         _precision.check_step("tgt", target)
         if pairs.shape[1] == 6:

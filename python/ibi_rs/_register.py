@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ibi_rs._inputs import Points
 from ibi_rs._model import Model
-from ibi_rs._view import View
+from ibi_rs._view import Viewpoint
 from ibi_rs.params import Params
 from ibi_rs.registration import Registration, Round
 
@@ -25,7 +25,7 @@ def register(
     src_frames: npt.ArrayLike | None = None,
     tgt_frames: npt.ArrayLike | None = None,
     similarity: npt.ArrayLike | None = None,
-    viewpoint: npt.ArrayLike | View | None = None,
+    viewpoint: Viewpoint | None = None,
     num_threads: int | None = None,
     max_instances: int | None = None,
     timeout_s: float | None = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core
-from ibi_rs._inputs import _floats, _frozen, _number, _rigid, _scan_rows, _viewpoint
+from ibi_rs._inputs import _eyes, _floats, _frozen, _number, _rigid, _scan_rows, _viewpoint
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,10 +126,21 @@ def depth_points(
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _camera(
-    value: npt.ArrayLike | View | None,
-) -> tuple[list[float] | None, npt.NDArray[np.float64] | None]:
-    """Return the camera's place and what it measured, as far as they are known."""
-    if isinstance(value, View):
-        return value.eye.tolist(), value.points
-    return None if value is None else _viewpoint(value), None
+Viewpoint = npt.ArrayLike | View | Sequence[View]
+"""Where a scene was seen from: one place, several, or cameras with all that they measured."""
+
+
+def _cameras(
+    value: Viewpoint | None,
+) -> tuple[list[list[float]] | None, list[npt.NDArray[np.float64]] | None]:
+    """Return the cameras' places and what each of them measured, as far as they are known."""
+    if value is None:
+        return None, None
+    views = [value] if isinstance(value, View) else value
+    if isinstance(views, (list, tuple)) and any(isinstance(view, View) for view in views):
+        for view in views:
+            if not isinstance(view, View):
+                raise TypeError(f"viewpoint: beside a View there can only be others, not {type(view).__name__}")
+        return [view.eye.tolist() for view in views], [view.points for view in views]
+    eyes = _eyes(value)
+    return eyes.tolist(), None

@@ -12,7 +12,7 @@ use crate::kernels::par::{self, Pool};
 use crate::params::Params;
 use crate::registration::{Registration, Round};
 use crate::rounds::{Play, Problem, Shortcuts, Stages, State};
-use crate::scene::{Cloud, Clouds, Correspondences, PointPairs, PreparedCloud, Scene, check_points};
+use crate::scene::{Cloud, Clouds, Correspondences, PointPairs, PreparedCloud, Scene};
 use crate::stages::{Enhance, EstimatePose, SelectSeeds, Validate};
 use crate::stop::StopReason;
 
@@ -226,10 +226,6 @@ impl<'a> Registrar<'a> {
                 Argument::TgtFrames,
                 &interrupt,
             )?;
-            let measured = target.measured.as_deref();
-            if let Some(points) = measured {
-                check_points(points, Argument::Measured)?;
-            }
             let clouds = Clouds::new(&self.source, prepared, self.params.resolution)?;
             let tolerances = self.params.tolerances();
             let (near, pairs) = par::join(
@@ -237,9 +233,10 @@ impl<'a> Registrar<'a> {
                 || PointPairs::new(correspondences, &clouds, self.params.oriented_normals, &interrupt),
             );
             let pairs = pairs?;
-            let scene = Scene::new(clouds, near?, measured, tolerances, &interrupt)?;
+            let scene = Scene::new(clouds, near?, &target.measured, tolerances, &interrupt)?;
             // Where nothing more was measured than the target there is nothing more to look at.
-            let closeup = measured.and_then(|measured| Closeup::new(&scene, measured, &interrupt));
+            let is_more = !target.measured.parts.is_empty() || scene.eyes.len() > 1;
+            let closeup = is_more.then(|| Closeup::new(&scene, &target.measured, &interrupt)).flatten();
             Ok::<_, Error>((scene, pairs, closeup))
         })?;
         Ok(State::new(Problem::new(scene, pairs, closeup, interrupt), Arc::clone(pool), start))
@@ -253,8 +250,8 @@ impl<'a> Registrar<'a> {
             Argument::SrcFrames => self.source.frames.is_some(),
             Argument::TgtFrames => target.frames.is_some(),
             Argument::Similarity => correspondences.has_similarity(),
-            Argument::Viewpoint => target.viewpoint.is_some(),
-            Argument::Measured => target.measured.is_some(),
+            Argument::Viewpoint => !target.viewpoints.is_empty(),
+            Argument::Measured => !target.measured.parts.is_empty(),
             Argument::Src | Argument::Tgt | Argument::Corr => true,
         }
     }

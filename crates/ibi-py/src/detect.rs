@@ -51,13 +51,14 @@ fn correspond<'py>(
     model: &Model,
     tgt: Rows<'py>,
     tgt_normals: Option<Rows<'py>>,
-    viewpoint: Option<[f64; 3]>,
+    viewpoint: Option<Vec<[f64; 3]>>,
+    measured: Option<Vec<Rows<'py>>>,
     remove_plane: Option<bool>,
     check_units: bool,
     num_threads: Option<usize>,
 ) -> PyResult<Matched<'py>> {
     let tgt = rows3(&tgt, Point3::new)?;
-    let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, None)?;
+    let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_deref())?;
     let options = Detect { remove_plane, check_units, ..Detect::default() };
     let matched = in_pool(py, num_threads, |interrupt| model.0.correspond(&scan, &options, interrupt))?;
     Ok((
@@ -80,8 +81,8 @@ fn detect<'py>(
     tgt: Rows<'py>,
     params: &str,
     tgt_normals: Option<Rows<'py>>,
-    viewpoint: Option<[f64; 3]>,
-    measured: Option<Rows<'py>>,
+    viewpoint: Option<Vec<[f64; 3]>>,
+    measured: Option<Vec<Rows<'py>>>,
     remove_plane: Option<bool>,
     check_units: bool,
     num_threads: Option<usize>,
@@ -90,7 +91,7 @@ fn detect<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let params = Some(params::parse(params)?);
     let tgt = rows3(&tgt, Point3::new)?;
-    let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_ref())?;
+    let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_deref())?;
     let found = observed(py, on_round.as_ref(), |cancel, caller, observer| {
         let options = Detect { params, remove_plane, check_units, run: run(cancel, num_threads) };
         let set_up = |registrar, matched: &MatchedScan| {

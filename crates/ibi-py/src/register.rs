@@ -34,8 +34,8 @@ fn register_clouds<'py>(
     tgt_normals: Option<Rows<'py>>,
     tgt_frames: Option<PyReadonlyArray3<'py, f64>>,
     similarity: Option<PyReadonlyArray1<'py, f64>>,
-    viewpoint: Option<[f64; 3]>,
-    measured: Option<Rows<'py>>,
+    viewpoint: Option<Vec<[f64; 3]>>,
+    measured: Option<Vec<Rows<'py>>>,
     num_threads: Option<usize>,
     on_round: Option<Py<PyAny>>,
     own: Option<OwnStages>,
@@ -43,7 +43,7 @@ fn register_clouds<'py>(
     let params = params::parse(params)?;
     // Copied, as other threads may write to the array; borrowed from here on, as scenes can be large.
     let tgt = rows3(&tgt, Point3::new)?;
-    let target = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_ref())?;
+    let target = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_deref())?;
     let target = with_frames(target, tgt_frames.as_ref())?;
     let mut correspondences = correspondences(corr)?;
     if let Some(similarity) = similarity {
@@ -62,15 +62,16 @@ fn register_clouds<'py>(
 pub(crate) fn scan<'a>(
     tgt: &'a [Point3<f64>],
     normals: Option<&Rows<'_>>,
-    viewpoint: Option<[f64; 3]>,
-    measured: Option<&Rows<'_>>,
+    viewpoints: Option<Vec<[f64; 3]>>,
+    measured: Option<&[Rows<'_>]>,
 ) -> PyResult<Cloud<'a>> {
     let mut cloud = with_normals(Cloud::new(tgt), normals)?;
-    if let Some(viewpoint) = viewpoint {
-        cloud = cloud.with_viewpoint(Point3::from(viewpoint));
+    if let Some(viewpoints) = viewpoints {
+        cloud = cloud.with_viewpoints(viewpoints.into_iter().map(Point3::from).collect());
     }
     if let Some(measured) = measured {
-        cloud = cloud.with_measured(rows3(measured, Point3::new)?);
+        let parts = measured.iter().map(|part| Ok(rows3(part, Point3::new)?.into()));
+        cloud = cloud.with_measured_by_each(parts.collect::<PyResult<_>>()?);
     }
     Ok(cloud)
 }

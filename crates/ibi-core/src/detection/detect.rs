@@ -17,7 +17,7 @@ use crate::params::Params;
 use crate::registrar::{Observer, Registrar};
 use crate::registration::Registration;
 use crate::scene::Correspondences;
-use crate::scene::{Cloud, check_points};
+use crate::scene::{Cloud, Measurement, check_points};
 use crate::stop::StopReason;
 
 /// Nearest model points that each scene point is joined to: walls and edges repeat on a part.
@@ -114,9 +114,8 @@ impl Model {
         observer: &mut dyn Observer,
     ) -> Result<Detection, DetectionError> {
         let start = Instant::now();
-        let mut params = options.params.clone().unwrap_or_else(|| match scan.viewpoint {
-            Some(_) => Params::single_view(),
-            None => Params::default(),
+        let mut params = options.params.clone().unwrap_or_else(|| {
+            if scan.viewpoints.is_empty() { Params::default() } else { Params::single_view() }
         });
         params.validate()?;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
@@ -151,8 +150,8 @@ impl Model {
             found
         };
         let is_over = registration.stop_reason.is_from_outside();
-        let of_units = if registration.poses.is_empty() && measured.len() >= doubts::ENOUGH && !is_over {
-            pool()?.install(|| self.unit_doubt(scan.viewpoint, &measured, &interrupt))?
+        let of_units = if registration.poses.is_empty() && measured.points.len() >= doubts::ENOUGH && !is_over {
+            pool()?.install(|| self.unit_doubt(scan.middle_of_viewpoints(), &measured.points, &interrupt))?
         } else {
             None
         };
@@ -183,9 +182,9 @@ impl Model {
         scan: &Cloud<'_>,
         options: &Detect,
         interrupt: &Interrupt,
-    ) -> Result<(MatchedScan, Vec<Point3<f64>>), DetectionError> {
+    ) -> Result<(MatchedScan, Measured), DetectionError> {
         let normals = self.normals().ok_or(DetectionError::NoNormals)?;
-        let viewpoint = scan.viewpoint;
+        let viewpoint = scan.middle_of_viewpoints();
         if viewpoint.is_none() && scan.normals.is_none() {
             return Err(DetectionError::NoSide);
         }
@@ -201,7 +200,10 @@ impl Model {
         }
         let setting =
             Setting { voxel: self.voxel(), diameter, viewpoint, remove_plane: options.remove_plane };
-        let prepared = Prepared::new(&measured, &setting, interrupt)?;
+        let mut prepared = Prepared::new(&measured, &setting, interrupt)?;
+        if scan.viewpoints.len() > 1 && scan.normals.is_none() {
+            prepared.turn_to_eyes(&scan.viewpoints, &scan.measured.parts);
+        }
         let holds_nothing =
             prepared.points.len() < MIN_POINTS || across(&prepared.points) <= self.source().spacing;
         let is_known = prepared.voxel <= self.voxel().max(diameter / MIN_VOXELS_PER_DIAMETER);
@@ -242,12 +244,13 @@ impl Model {
         }
         if let Some(eye) = &viewpoint {
             let is_behind = prepared.is_behind_table.then_some(Doubt::BehindPlane);
-            doubts.extend(is_behind.or_else(|| doubts::of_viewpoint(eye, &prepared)));
+            let is_one = scan.viewpoints.len() == 1;
+            doubts.extend(is_behind.or_else(|| is_one.then(|| doubts::of_viewpoint(eye, &prepared)).flatten()));
         }
         doubts.extend(self.normals_doubt(normals, interrupt)?);
 
         let Prepared { points, normals, .. } = prepared;
-        Ok((MatchedScan { points, normals, matches, voxel, doubts }, measured.points))
+        Ok((MatchedScan { points, normals, matches, voxel, doubts }, measured))
     }
 
     /// Whether the normals of a cloud point inwards; those of a mesh were turned.
@@ -293,11 +296,14 @@ impl Model {
 
 impl MatchedScan {
     /// What a registrar takes. `scan` is as it was given, `measured` what of it is finite.
-    fn input<'a>(&'a self, scan: &'a Cloud<'_>, measured: &'a [Point3<f64>]) -> (Cloud<'a>, Correspondences) {
+    fn input<'a>(&'a self, scan: &'a Cloud<'_>, measured: &'a Measured) -> (Cloud<'a>, Correspondences) {
         let mut target = Cloud::new(&self.points).with_normals(self.normals.clone());
-        if let Some(viewpoint) = scan.viewpoint {
-            target =
-                target.with_viewpoint(viewpoint).with_measured(scan.measured.as_deref().unwrap_or(measured));
+        if !scan.viewpoints.is_empty() {
+            target = target.with_viewpoints(scan.viewpoints.clone());
+            target.measured = match &scan.measured.parts[..] {
+                [] => Measurement { parts: vec![measured.points[..].into()], normals: measured.normals.clone() },
+                _ => scan.measured.clone(),
+            };
         }
         let rows = self.matches.rows.iter().map(|pair| pair.map(|row| row as usize)).collect();
         (target, Correspondences::from_rows(rows).with_similarity(self.matches.similarity.clone()))

@@ -1,5 +1,7 @@
 //! A scan as it can be matched: without rows that are no points, thinned, without its table.
 
+use std::borrow::Cow;
+
 use nalgebra::{Point3, Vector3};
 
 use super::bodies::{Body, bodies};
@@ -8,6 +10,7 @@ use super::{DetectionError, VOXELS_PER_SPACING};
 use crate::error::{Argument, Error};
 use crate::features::{Neighborhood, Plane, PlaneSearch, dominant_plane, estimate_normals, voxel_downsample};
 use crate::interrupt::Interrupt;
+use crate::kernels::nearby::Nearby;
 use crate::kernels::neighbors::Neighbors;
 use crate::scene::{Cloud, PreparedCloud};
 
@@ -157,6 +160,29 @@ impl Prepared {
         };
         let (whole, whole_normals) = (whole.points, whole.normals);
         Ok(Self { points, normals, voxel, whole, whole_normals, is_behind_table })
+    }
+}
+
+impl Prepared {
+    /// Turns each normal to those of the eyes that saw the point: of all, unless it is known what each of them measured.
+    pub(super) fn turn_to_eyes(&mut self, eyes: &[Point3<f64>], parts: &[Cow<'_, [Point3<f64>]>]) {
+        let mut ways = vec![Vector3::zeros(); self.points.len()];
+        for (k, eye) in eyes.iter().enumerate() {
+            let saw = match parts.get(k) {
+                Some(part) if parts.len() == eyes.len() => {
+                    Nearby::new(part, self.voxel).any_within_each(self.voxel, &self.points)
+                }
+                _ => vec![true; self.points.len()],
+            };
+            for ((way, point), _) in ways.iter_mut().zip(&self.points).zip(saw).filter(|(_, saw)| *saw) {
+                *way += (eye - point).try_normalize(0.0).unwrap_or_default();
+            }
+        }
+        for (normal, way) in self.normals.iter_mut().zip(ways) {
+            if normal.dot(&way) < 0.0 {
+                normal.neg_mut();
+            }
+        }
     }
 }
 

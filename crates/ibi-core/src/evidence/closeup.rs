@@ -5,13 +5,16 @@ use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
 use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
 use super::noise::noise_of_rays;
 use super::odds::{BLURRED, Measures};
-use super::rays::Rays;
+use super::rays::{Rays, visible};
 use super::seen::{Look, Seen, Tally, Tolerance, merge, sight};
 use super::settle::{Steps, settle};
 use super::slip::{information, losses, moved, principal_motions, worth};
 use crate::detail::Detail;
 use crate::interrupt::Interrupt;
-use crate::scene::Scene;
+use crate::kernels::nearby::spacing_until;
+use crate::kernels::par;
+use crate::kernels::sight::asked;
+use crate::scene::{Measurement, Scene};
 
 /// What one eye or several have measured in all, and where the source's faces end.
 #[derive(Debug)]
@@ -67,19 +70,36 @@ struct At {
 impl Closeup {
     /// Of what was `measured` from the viewpoint of a scene with oriented normals. `None` for others, where the noise blurs what is
     /// to be told apart, or if interrupted.
-    pub(crate) fn new(scene: &Scene<'_>, measured: &[Point3<f64>], interrupt: &Interrupt) -> Option<Self> {
+    pub(crate) fn new(scene: &Scene<'_>, measured: &Measurement<'_>, interrupt: &Interrupt) -> Option<Self> {
         let normals = scene.source.normals.as_ref().filter(|_| scene.is_one_sided())?;
-        let rays = vec![Rays::new(scene.target.viewpoint?, measured)?];
-        if interrupt.is_set() {
+        let places = &scene.target.viewpoints;
+        let (all, of_all) = measured.of(0, places.len(), &scene.target);
+        // What several have measured together is known no better than its points lie apart.
+        let spacing = match of_all {
+            Some(_) => spacing_until(all, || interrupt.is_set())?,
+            None => 0.0,
+        };
+        let of_eye = |at: usize| {
+            let place = scene.eyes[at].place;
+            let row = places.iter().position(|of_any| *of_any == place)?;
+            let (points, normals) = measured.of(row, places.len(), &scene.target);
+            let Some(normals) = normals else { return Rays::new(place, points) };
+            let seen = visible(&place, points, normals, spacing);
+            Rays::new(place, &seen.into_iter().map(|row| points[row as usize]).collect::<Vec<_>>())
+        };
+        let rays = par::map(scene.eyes.len(), 1, |at| (!interrupt.is_set()).then(|| of_eye(at)).flatten());
+        let rays: Vec<Rays> = rays.into_iter().flatten().collect();
+        if rays.is_empty() || interrupt.is_set() {
             return None;
         }
         let voxel = VOXELS_PER_SPACING * scene.resolution;
         // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
         let noise = noise_of_rays(&rays[0], &scene.target.points);
-        if noise >= BLURRED * voxel {
+        if noise >= BLURRED * voxel && rays.len() == 1 {
             return None;
         }
         let tolerance = Tolerance::of(voxel, noise);
+        let tolerance = Tolerance { aside: tolerance.aside.max(spacing), ..tolerance };
         let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
         let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);
         Some(Self { rays, rim, voxel, noise, tolerance })
@@ -133,6 +153,7 @@ impl Closeup {
                 overrun,
                 losses: losses_of,
                 noise: noise / voxel,
+                num_eyes: self.rays.len() as u32,
                 ..Measures::default()
             },
         }
@@ -141,18 +162,24 @@ impl Closeup {
     /// What a pose is worth, see [`worth`].
     fn worth(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> f64 {
         let at = self.at(scene, pose, SETTLED_BY);
-        let run_on: f64 =
-            self.rays.iter().map(|rays| run_on(&self.rim, rays, at.placed(pose), self.tolerance)).sum();
+        let rays = self.asked(scene, pose);
+        let run_on = run_on(&self.rim, &rays, at.placed(pose), self.tolerance);
         let is_asked = |row: &&u32| at.sight[**row as usize].seen != Seen::Away;
         let num_ends = self.rim.rows.iter().filter(is_asked).count() as u32;
         worth(&at.sight, run_on, num_ends, self.tolerance.across)
     }
 
     fn contour(&self, scene: &Scene<'_>, placed: Placed<'_>) -> Contour {
-        let rays = Some(&self.rays[0]).filter(|_| self.rays.len() == 1);
+        let rays = self.asked(scene, placed.target_from_source);
         Self::scan(scene).map_or_else(Contour::default, |scan| {
-            contour(&self.rim, scan, rays, placed, self.tolerance, self.voxel)
+            contour(&self.rim, scan, &rays, placed, self.tolerance, self.voxel)
         })
+    }
+
+    /// Of the eyes that know most of what lies around a pose.
+    fn asked(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Vec<&Rays> {
+        let places: Vec<Point3<f64>> = self.rays.iter().map(|rays| *rays.eye()).collect();
+        asked(&places, &(pose * scene.source.centre)).into_iter().map(|row| &self.rays[row]).collect()
     }
 
     fn scan<'s>(scene: &'s Scene<'_>) -> Option<Scan<'s>> {
@@ -167,7 +194,7 @@ impl Closeup {
         let points: Vec<_> = source.points.iter().map(|p| rotation * p + pose.translation.vector).collect();
         let normals: Vec<_> = source.normals.iter().flatten().map(|n| rotation * n).collect();
         let mut of_all: Option<Vec<Look>> = None;
-        for rays in &self.rays {
+        for rays in self.asked(scene, pose) {
             let own = source.own_shadow(Detail::Look);
             let is_hidden = own.map_or(&[][..], |own| own.from(rays.eye(), pose));
             let of_one = sight(rays, &points, &normals, is_hidden, every, self.tolerance);

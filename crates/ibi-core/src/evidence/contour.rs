@@ -119,8 +119,8 @@ pub struct Contour {
 const SAME_FACE_COS: f64 = 0.8;
 
 /// A face goes on where a point of the scan lies within `aside` (a voxel of a thinned scan) of a place beyond its end, in its tangent
-/// plane and with its normal. It ends where it does not and all that was measured there lies behind. Where no `rays` are known it
-/// ends wherever it does not go on.
+/// plane and with its normal. It ends where it does not and all that one of the eyes measured there lies behind. Where no `rays` are known
+/// it ends wherever it does not go on.
 ///
 /// # Complexity
 /// O(places of the rim), times the rays that pass near each.
@@ -128,7 +128,7 @@ const SAME_FACE_COS: f64 = 0.8;
 pub fn contour(
     rim: &Rim,
     scan: Scan<'_>,
-    rays: Option<&Rays>,
+    rays: &[&Rays],
     placed: Placed<'_>,
     tolerance: Tolerance,
     aside: f64,
@@ -144,8 +144,8 @@ pub fn contour(
             let gap = (scan.points[near] - place).dot(normal);
             gap.abs() <= tolerance.across && scan.normals[near].dot(normal) >= SAME_FACE_COS
         });
-        let is_past =
-            || rays.is_none_or(|rays| look(rays, place, normal, tolerance).seen == Seen::Contradicted);
+        let sees_past = |rays: &&Rays| look(rays, place, normal, tolerance).seen == Seen::Contradicted;
+        let is_past = || rays.is_empty() || rays.iter().any(sees_past);
         *if goes_on {
             &mut contour.runs_on
         } else if is_past() {
@@ -158,12 +158,15 @@ pub fn contour(
 }
 
 /// How many places of the rim the faces of a part run on at, as the rays alone have it: each counts as the share of its rays that end
-/// in the tangent plane. Where a pose shifts a little that changes a little, so it is for the search for a better one
+/// in the tangent plane, of the eye of which most do. Where a pose shifts a little that changes a little, so it is for the search for a better one
 /// ([`super::slip::worth`]); [`contour`], which also compares normals, tells more of where it ends up.
 #[must_use]
-pub fn run_on(rim: &Rim, rays: &Rays, placed: Placed<'_>, tolerance: Tolerance) -> f64 {
+pub fn run_on(rim: &Rim, rays: &[&Rays], placed: Placed<'_>, tolerance: Tolerance) -> f64 {
     let beyond = rim.beyond(placed.points, placed.sight, placed.target_from_source);
-    beyond.map(|(row, place)| look(rays, &place, &placed.normals[row], tolerance).share).sum()
+    let share = |(row, place): (usize, Point3<f64>)| {
+        rays.iter().map(|rays| look(rays, &place, &placed.normals[row], tolerance).share).fold(0.0, f64::max)
+    };
+    beyond.map(share).sum()
 }
 
 /// What was measured around a part, where it should not be.

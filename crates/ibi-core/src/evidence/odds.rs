@@ -18,6 +18,8 @@ pub struct Measures {
     pub losses: [f64; 3],
     /// Standard deviation of the scan across its surfaces, voxels.
     pub noise: f64,
+    /// Cameras that saw the scene.
+    pub num_eyes: u32,
     /// How close its points lie on the thinned clouds, see [`super::Support::closeness`].
     pub closeness: f64,
     /// -log10 of the chance that as many correspondences would agree, see [`super::Support::evidence`].
@@ -79,7 +81,8 @@ impl Measures {
         let [_, second, third] = self.losses.map(held);
         let sharp = [1.0, contradicted, runs_on, beyond, second, third, closeness];
         let blurred = [1.0, self.evidence.ln_1p(), self.closeness];
-        let blur = ((self.noise - NOISE[0]) / (NOISE[1] - NOISE[0])).clamp(0.0, 1.0);
+        let blur = if self.num_eyes > 1 { f64::NEG_INFINITY } else { self.noise };
+        let blur = ((blur - NOISE[0]) / (NOISE[1] - NOISE[0])).clamp(0.0, 1.0);
         let weighed =
             |terms: &[f64], weights: &[f64]| -> f64 { terms.iter().zip(weights).map(|(a, b)| a * b).sum() };
         (1.0 - blur) * weighed(&sharp, &SHARP) + blur * weighed(&blurred, &ONE_SIDED)

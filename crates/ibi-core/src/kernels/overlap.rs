@@ -8,7 +8,7 @@ use super::graph::up_to_sign;
 use super::nearby::Nearby;
 use super::par;
 use super::rng::Rng;
-use super::sight::{Sight, View};
+use super::sight::{Eye, Sight, View, asked};
 
 /// A cloud with its normals, if they are to count.
 #[derive(Debug, Clone, Copy)]
@@ -229,7 +229,7 @@ fn each_place(
     let shift = target_from_source.translation.vector;
     let sighted = contact.view.filter(|_| contact.oriented).zip(source.normals);
     let sighted =
-        sighted.map(|(view, normals)| Sighted::new(view, normals, target_from_source, contact.distance));
+        sighted.map(|(view, normals)| Sighted::new(&view, normals, target_from_source, contact.distance));
     let (mut visible, mut moved) = (Vec::with_capacity(rows.len()), Vec::with_capacity(rows.len()));
     for i in rows {
         let point = rotation * source.points[i] + shift;
@@ -250,12 +250,11 @@ fn each_place(
     }
 }
 
-/// The camera's view of the source in one pose.
+/// The cameras' view of the source in one pose.
 struct Sighted<'a> {
-    view: View<'a>,
+    /// With which source points are behind other ones.
+    eyes: Vec<(&'a Eye, &'a [bool])>,
     normals: &'a [Vector3<f64>],
-    /// Which source points are behind other ones.
-    is_hidden: &'a [bool],
     tolerance: f64,
 }
 
@@ -265,23 +264,36 @@ pub const MIN_FACING_COS: f64 = 0.15;
 
 impl<'a> Sighted<'a> {
     fn new(
-        view: View<'a>,
+        view: &View<'a>,
         normals: &'a [Vector3<f64>],
         target_from_source: &Isometry3<f64>,
         tolerance: f64,
     ) -> Self {
-        let is_hidden = view.own.map_or(&[][..], |own| own.from(&view.eye, target_from_source));
-        Self { view, normals, is_hidden, tolerance }
+        let places: Vec<Point3<f64>> = view.eyes.iter().map(|eye| eye.place).collect();
+        let middle = view.own.map_or_else(Point3::origin, |own| *own.middle());
+        let with_shadow = |row: usize| {
+            let eye = &view.eyes[row];
+            (eye, view.own.map_or(&[][..], |own| own.from(&eye.place, target_from_source)))
+        };
+        let eyes = asked(&places, &(target_from_source * middle)).into_iter().take(1).map(with_shadow).collect();
+        Self { eyes, normals, tolerance }
     }
 
     fn sight(&self, i: usize, rotation: &Rotation3<f64>, moved: &Point3<f64>) -> Sight {
-        let to_eye = self.view.eye - moved;
-        if (rotation * self.normals[i]).dot(&to_eye) <= MIN_FACING_COS * to_eye.norm()
-            || self.is_hidden.get(i).is_some_and(|&is_hidden| is_hidden)
-        {
-            return Sight::Hidden;
+        let normal = rotation * self.normals[i];
+        let mut of_all = Sight::Hidden;
+        for (eye, is_hidden) in &self.eyes {
+            let to_eye = eye.place - moved;
+            if normal.dot(&to_eye) <= MIN_FACING_COS * to_eye.norm() || is_hidden.get(i) == Some(&true) {
+                continue;
+            }
+            match eye.measured.as_ref().map_or(Sight::Open, |seen| seen.sight(moved, self.tolerance)) {
+                Sight::Open => return Sight::Open,
+                Sight::Through => of_all = Sight::Through,
+                Sight::Hidden => {}
+            }
         }
-        self.view.measured.map_or(Sight::Open, |measured| measured.sight(moved, self.tolerance))
+        of_all
     }
 }
 
@@ -296,7 +308,7 @@ pub fn visible(
 ) -> Vec<u32> {
     let all = 0..source.points.len() as u32;
     let Some(normals) = source.normals else { return all.collect() };
-    let sighted = Sighted::new(*view, normals, target_from_source, tolerance);
+    let sighted = Sighted::new(view, normals, target_from_source, tolerance);
     let rotation = target_from_source.rotation.to_rotation_matrix();
     let shift = target_from_source.translation.vector;
     let is_visible = |&row: &u32| {

@@ -28,23 +28,58 @@ pub(crate) fn across(forward: &Vector3<f64>) -> [Vector3<f64>; 2] {
     [right, forward.cross(&right)]
 }
 
-/// A camera and what is known of its view.
-#[derive(Debug, Clone, Copy)]
-pub struct View<'a> {
-    /// Where the camera stands, in the frame of the target.
-    pub eye: Point3<f64>,
-    /// Which source points the source itself hides.
-    pub own: Option<&'a OwnShadow>,
-    /// What the camera measured.
-    pub measured: Option<&'a RangeImage>,
+/// A camera.
+#[derive(Debug)]
+pub struct Eye {
+    /// Where it stands, in the frame of the target.
+    pub place: Point3<f64>,
+    /// What it measured.
+    pub measured: Option<RangeImage>,
 }
 
-impl View<'_> {
+impl Eye {
     /// A camera of which nothing is known but its place.
     #[must_use]
-    pub fn from(eye: Point3<f64>) -> Self {
-        Self { eye, own: None, measured: None }
+    pub fn at(place: Point3<f64>) -> Self {
+        Self { place, measured: None }
     }
+}
+
+/// What is known of how a scene was seen.
+#[derive(Debug, Clone, Copy)]
+pub struct View<'a> {
+    /// By these cameras: a point is seen if one of them sees it.
+    pub eyes: &'a [Eye],
+    /// Which source points the source itself hides.
+    pub own: Option<&'a OwnShadow>,
+}
+
+/// So many eyes are asked of a pose, at most.
+const MOST_ASKED: usize = 4;
+
+/// Which of `eyes` are asked of what lies around a place: the nearest, and then, each time, the one that looks from farthest beside
+/// those.
+#[must_use]
+pub(crate) fn asked(eyes: &[Point3<f64>], place: &Point3<f64>) -> Vec<usize> {
+    if eyes.len() <= MOST_ASKED {
+        return (0..eyes.len()).collect();
+    }
+    let ways: Vec<Vector3<f64>> = eyes.iter().map(|eye| eye - place).collect();
+    let nearest = (0..eyes.len()).min_by(|&a, &b| ways[a].norm_squared().total_cmp(&ways[b].norm_squared()));
+    let directions: Vec<_> = ways.iter().map(|way| way.try_normalize(0.0).unwrap_or_default()).collect();
+    spread(nearest.unwrap_or(0), MOST_ASKED, eyes.len(), |a, b| (directions[a] - directions[b]).norm_squared())
+}
+
+/// `most` of `count` things, or all: the `first`, and then, each time, the one that is farthest from all before it.
+pub(crate) fn spread(first: usize, most: usize, count: usize, far: impl Fn(usize, usize) -> f64) -> Vec<usize> {
+    let mut picked = vec![first];
+    let mut gap: Vec<f64> = (0..count).map(|i| far(i, first)).collect();
+    while picked.len() < most.min(count) {
+        let next = (0..count).max_by(|&a, &b| gap[a].total_cmp(&gap[b]).then(b.cmp(&a))).unwrap_or(first);
+        gap.iter_mut().enumerate().for_each(|(i, gap)| *gap = gap.min(far(i, next)));
+        picked.push(next);
+    }
+    picked
 }
 
 /// Directions in which shadows are known: neighbours are about 20 degrees apart.
@@ -140,6 +175,12 @@ impl OwnShadow {
         let pick = |all: &Vec<bool>| rows.iter().map(|row| all[answer(row) as usize]).collect();
         let is_hidden = self.is_hidden.iter().map(pick).collect();
         Self { middle: self.middle, directions: self.directions.clone(), is_hidden, of_all: None }
+    }
+
+    /// About the middle of the points.
+    #[must_use]
+    pub fn middle(&self) -> &Point3<f64> {
+        &self.middle
     }
 
     /// Which points are hidden from a camera at `eye` once the pose has moved them: from the nearest direction that is

@@ -24,8 +24,8 @@ use crate::symmetries::Symmetries;
 pub struct Cloud<'a> {
     pub(crate) points: Cow<'a, [Point3<f64>]>,
     pub(crate) normals: Option<Vec<Vector3<f64>>>,
-    pub(crate) viewpoint: Option<Point3<f64>>,
-    pub(crate) measured: Option<Cow<'a, [Point3<f64>]>>,
+    pub(crate) viewpoints: Vec<Point3<f64>>,
+    pub(crate) measured: Measurement<'a>,
     pub(crate) frames: Option<Vec<Matrix3<f64>>>,
     pub(crate) symmetries: Symmetries,
 }
@@ -59,19 +59,72 @@ impl<'a> Cloud<'a> {
         self
     }
 
+    /// Where the cameras stood on average.
+    pub(crate) fn middle_of_viewpoints(&self) -> Option<Point3<f64>> {
+        let sum: Vector3<f64> = self.viewpoints.iter().map(|eye| eye.coords).sum();
+        (!self.viewpoints.is_empty()).then(|| Point3::from(sum / self.viewpoints.len() as f64))
+    }
+
     /// Where the depth camera stood, in the frame of the points; for scenes seen from one side.
     #[must_use]
     pub fn with_viewpoint(mut self, viewpoint: Point3<f64>) -> Self {
-        self.viewpoint = Some(viewpoint);
+        self.viewpoints = vec![viewpoint];
         self
     }
 
-    /// All that the camera at the viewpoint measured, where the cloud is only a part of it: thinned, or without the
-    /// table. It tells where there is nothing, and what hides what. By default the cloud itself.
+    /// Where several depth cameras stood, or one that went about: what one of them sees was seen.
+    #[must_use]
+    pub fn with_viewpoints(mut self, viewpoints: Vec<Point3<f64>>) -> Self {
+        self.viewpoints = viewpoints;
+        self
+    }
+
+    /// All that the camera at the viewpoint measured, or all of them together, where the cloud is only a part of it: thinned, or
+    /// without the table. It tells where there is nothing, and what hides what. By default the cloud itself.
     #[must_use]
     pub fn with_measured(mut self, points: impl Into<Cow<'a, [Point3<f64>]>>) -> Self {
-        self.measured = Some(points.into());
+        self.measured.parts = vec![points.into()];
         self
+    }
+
+    /// The same, by camera: as many parts as there are viewpoints.
+    #[must_use]
+    pub fn with_measured_by_each(mut self, parts: Vec<Cow<'a, [Point3<f64>]>>) -> Self {
+        self.measured.parts = parts;
+        self
+    }
+
+    /// Outward normals of all that several cameras measured together, one per point, any length but 0: which of them saw a point is
+    /// told by these.
+    #[must_use]
+    pub fn with_measured_normals(mut self, normals: Vec<Vector3<f64>>) -> Self {
+        self.measured.normals = Some(normals);
+        self
+    }
+}
+
+/// All that the cameras at the viewpoints of a cloud measured.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Measurement<'a> {
+    /// Of each, or of all in one; none if it is the cloud itself.
+    pub(crate) parts: Vec<Cow<'a, [Point3<f64>]>>,
+    /// Of the one part that is of all.
+    pub(crate) normals: Option<Vec<Vector3<f64>>>,
+}
+
+impl<'a> Measurement<'a> {
+    /// What one of `num` cameras measured, or may have, and its normals if several have measured it together.
+    pub(crate) fn of<'s>(
+        &'s self,
+        eye: usize,
+        num: usize,
+        target: &'s PreparedCloud<'a>,
+    ) -> (&'s [Point3<f64>], Option<&'s [Vector3<f64>]>) {
+        match &self.parts[..] {
+            [] => (&target.points, target.normals.as_deref().filter(|_| num > 1)),
+            [all] if num > 1 => (all, self.normals.as_deref()),
+            parts => (&parts[eye], None),
+        }
     }
 }
 
@@ -96,8 +149,8 @@ pub struct PreparedCloud<'a> {
     pub normals: Option<Vec<Vector3<f64>>>,
     /// Local reference frames, one per point, if they were given.
     pub frames: Option<Vec<Matrix3<f64>>>,
-    /// Where the depth camera stood.
-    pub viewpoint: Option<Point3<f64>>,
+    /// Where the depth cameras stood.
+    pub viewpoints: Vec<Point3<f64>>,
     /// What leaves the cloud looking the same, if that was declared.
     pub symmetries: Symmetries,
     /// Mean distance of a point to its nearest distinct other point, in data units; stray points do not count.
@@ -151,8 +204,14 @@ impl<'a> PreparedCloud<'a> {
         if points.len() > u32::MAX as usize {
             return Err(Error::TooMany { argument, len: points.len() });
         }
-        if let Some(viewpoint) = cloud.viewpoint {
-            check_points(&[viewpoint], Argument::Viewpoint)?;
+        check_points(&cloud.viewpoints, Argument::Viewpoint)?;
+        let (parts, num_eyes) = (&cloud.measured.parts, cloud.viewpoints.len());
+        for part in parts {
+            check_points(part, Argument::Measured)?;
+        }
+        if parts.len() > 1 && parts.len() != num_eyes {
+            let (argument, of) = (Argument::Measured, Argument::Viewpoint);
+            return Err(Error::LengthMismatch { argument, len: parts.len(), of, expected: num_eyes });
         }
         let unit_normals = cloud
             .normals
@@ -183,7 +242,7 @@ impl<'a> PreparedCloud<'a> {
         Ok(Self {
             points: points.clone(),
             frames: cloud.frames.clone(),
-            viewpoint: cloud.viewpoint,
+            viewpoints: cloud.viewpoints.clone(),
             symmetries: cloud.symmetries.clone(),
             spacing,
             extent,

@@ -13,11 +13,12 @@ use crate::interrupt::Interrupt;
 use crate::kernels::icp::{Stop, icp};
 use crate::kernels::nearby::Nearby;
 use crate::kernels::overlap::{Contact, Fit, Place, Surface, chance_fit, fit, overlap, own_fit, places};
+use crate::kernels::par;
 use crate::kernels::rng::Rng;
-use crate::kernels::sight::{RangeImage, View};
+use crate::kernels::sight::{Eye, RangeImage, View, spread};
 
 pub use cloud::{Cloud, PreparedCloud};
-pub(crate) use cloud::{PROBE_POINTS, SCOUT_POINTS, check_points};
+pub(crate) use cloud::{Measurement, PROBE_POINTS, SCOUT_POINTS, check_points};
 pub(crate) use clouds::Clouds;
 pub use correspondence::{Alive, Correspondences, PointPairs};
 pub use tolerances::Tolerances;
@@ -37,30 +38,40 @@ pub struct Scene<'a> {
     pub near_source: Nearby,
     /// The target points within the same reach.
     pub near_target: Nearby,
-    /// What the camera measured; with oriented normals and a viewpoint.
-    pub measured: Option<RangeImage>,
+    /// The cameras that saw it; with oriented normals and a viewpoint.
+    pub eyes: Vec<Eye>,
 }
 
 impl<'a> Scene<'a> {
     pub(crate) fn new(
         clouds: Clouds<'a>,
         [near_source, near_target]: [Nearby; 2],
-        measured: Option<&[Point3<f64>]>,
+        measured: &Measurement<'_>,
         tolerances: Tolerances,
         interrupt: &Interrupt,
     ) -> Result<Self, Error> {
         interrupt.proceed()?;
         let Clouds { source, target, resolution } = clouds;
         let mut scene =
-            Self { source, target, resolution, tolerances, near_source, near_target, measured: None };
-        if scene.is_one_sided()
-            && let Some(eye) = scene.target.viewpoint
-        {
+            Self { source, target, resolution, tolerances, near_source, near_target, eyes: Vec::new() };
+        if scene.is_one_sided() {
             // Now, not first from within a parallel map: both are one themselves.
             scene.source.shade(interrupt);
             interrupt.proceed()?;
-            let points = measured.unwrap_or(&scene.target.points);
-            scene.measured = RangeImage::new(eye, points, PIXEL_PR * resolution);
+            let places = &scene.target.viewpoints;
+            let far = |a: usize, b: usize| (places[a] - places[b]).norm_squared();
+            let rows = spread(0, MOST_EYES, places.len(), far);
+            scene.eyes = par::map(rows.len(), 1, |at| {
+                let row = rows[at];
+                let (points, normals) = measured.of(row, places.len(), &scene.target);
+                let place = places[row];
+                let facing = normals.map(|normals| {
+                    let facing = points.iter().zip(normals).filter(|(p, n)| n.dot(&(place - *p)) > 0.0);
+                    facing.map(|(p, _)| *p).collect::<Vec<_>>()
+                });
+                let points = facing.as_deref().unwrap_or(points);
+                Eye { place, measured: RangeImage::new(place, points, PIXEL_PR * resolution) }
+            });
         }
         interrupt.proceed()?;
         Ok(scene)
@@ -165,7 +176,7 @@ impl Scene<'_> {
     pub(crate) fn is_one_sided(&self) -> bool {
         let Tolerances { min_normal_cos, oriented_normals, .. } = self.tolerances;
         let with_normals = min_normal_cos.is_some() && self.source.normals.is_some();
-        with_normals && oriented_normals && self.target.viewpoint.is_some()
+        with_normals && oriented_normals && !self.target.viewpoints.is_empty()
     }
 
     /// A few source points against the target within a reach of 2 `d_op`; more if they are seen from one side: then few
@@ -185,8 +196,7 @@ impl Scene<'_> {
     }
 
     fn view(&self, detail: Detail) -> Option<View<'_>> {
-        let eye = self.target.viewpoint.filter(|_| self.is_one_sided())?;
-        Some(View { eye, own: self.source.own_shadow(detail), measured: self.measured.as_ref() })
+        self.is_one_sided().then(|| View { eyes: &self.eyes, own: self.source.own_shadow(detail) })
     }
 
     fn surfaces(&self, distance_pr: f64) -> (Surface<'_>, Surface<'_>, Contact<'_>) {
@@ -202,6 +212,9 @@ impl Scene<'_> {
         (self.source.surface(with_normals), self.target.surface(with_normals), contact)
     }
 }
+
+/// Of more cameras, so many that stand far from each other stand for all.
+const MOST_EYES: usize = 12;
 
 /// Least width of a pixel of what the camera measured: wider than the errors of a pose, narrower than a part.
 const PIXEL_PR: f64 = 0.6;
