@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core, _precision
+from ibi_rs._box import Box
 from ibi_rs._inputs import (
     Points,
     _correspondences,
@@ -246,6 +247,7 @@ class Model:
         viewpoint: npt.ArrayLike | View | None = None,
         remove_plane: bool | None = None,
         check_units: bool = True,
+        roi: Box | npt.ArrayLike | None = None,
         num_threads: int | None = None,
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
@@ -256,7 +258,7 @@ class Model:
 
         Parameters
         ----------
-        tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads
+        tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads
             As in :meth:`detect`.
 
         Returns
@@ -270,7 +272,7 @@ class Model:
         InputError, TypeError, ValueError
             Those of :meth:`detect`.
         """
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
+        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
         scan.pop("measured")
         return Matches._of(_core.correspond(self._core, **scan))
 
@@ -283,6 +285,7 @@ class Model:
         viewpoint: npt.ArrayLike | View | None = None,
         remove_plane: bool | None = None,
         check_units: bool = True,
+        roi: Box | npt.ArrayLike | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -311,6 +314,10 @@ class Model:
             Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts
             is the box around all points but the outermost hundredth on each side; fewer than 100 points tell
             nothing.
+        roi : Box or (2, 3) array_like, optional
+            What of the scan is looked into: a :class:`Box`, or the corners of the least and of the largest
+            coordinates of one along the axes of the scan, data units. What lies outside is neither searched
+            nor matched, but what was measured there still tells where there is nothing. By default all.
         num_threads, max_instances, callback
             As in :func:`register`.
         timeout_s : float, optional
@@ -343,7 +350,7 @@ class Model:
         if params is None:
             params = Params() if viewpoint is None else Params.single_view()
         params = _limited(params, max_instances, timeout_s)
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
+        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
         own = params._own()
         raw = _core.detect(
             self._core,
