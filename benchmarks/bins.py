@@ -175,9 +175,10 @@ def main() -> None:
                 shown = [f"{row['part']} {row['right']}+{row['hidden']} -{row['wrong']}" for row in new]
                 seconds = sum(float(row["seconds"]) for row in new)
                 tables.show(f"{new[0]['scan']}, {WAYS[way]}: {', '.join(shown)}; {seconds:.1f} s")
+            if args.docs:
+                records.write(records.RECORDS, RECORD, rows)
     print(markdown(rows))
     if args.docs:
-        records.write(records.RECORDS, RECORD, rows)
         records.fill(PAGE, {"bins": markdown(rows)})
 
 
