@@ -5,11 +5,13 @@ Start with :func:`register`. Lengths in :class:`Params` are multiples of the res
 
 from ibi_rs import features, io, metrics, plot, stages, synth, viz
 from ibi_rs._batch import register_batch
+from ibi_rs._box import Box
 from ibi_rs._core import InputError, ParamsError, __version__
 from ibi_rs._job import Job, JobError
 from ibi_rs._match import match
 from ibi_rs._matches import Matches
 from ibi_rs._model import Model
+from ibi_rs._models import Models, detect
 from ibi_rs._ray import RayExecutor
 from ibi_rs._register import register
 from ibi_rs._view import View
@@ -35,6 +37,7 @@ from ibi_rs.variants import (
 )
 
 __all__ = [
+    "Box",
     "Evidence",
     "Gsac",
     "Gtm",
@@ -49,6 +52,7 @@ __all__ = [
     "Matches",
     "Measures",
     "Model",
+    "Models",
     "Nnsr",
     "None_",
     "Off",
@@ -69,6 +73,7 @@ __all__ = [
     "View",
     "Voting",
     "__version__",
+    "detect",
     "features",
     "find_symmetries",
     "io",

@@ -93,6 +93,12 @@ class Model:
     def symmetries(self) -> Symmetries: ...
     def diameter(self, num_threads: int | None) -> float: ...
 
+@final
+class Models:
+    """Models with their names, which are different."""
+
+    def __new__(cls, parts: Sequence[tuple[str, Model]]) -> Models: ...
+
 def register(
     model: Model,
     tgt: _Floats,
@@ -129,6 +135,7 @@ def correspond(
     measured: Sequence[_Floats] | None,
     remove_plane: bool | None,
     check_units: bool,
+    roi: tuple[_Floats, Sequence[float]] | None,
     num_threads: int | None,
 ) -> tuple[_Floats, _Floats, _Ints, _Floats, float, list[str]]:
     """Points, normals, [row of the model, row of the points], similarity, voxel, warnings."""
@@ -142,11 +149,28 @@ def detect(
     measured: Sequence[_Floats] | None,
     remove_plane: bool | None,
     check_units: bool,
+    roi: tuple[_Floats, Sequence[float]] | None,
     num_threads: int | None,
     on_round: Callable[[str], object] | None,
     own: Callable[[_Floats, _Ints], dict[str, Callable[..., object]]] | None,
 ) -> dict[str, Any]:
     """As `register`; and ``warnings``, and ``resolution_set``, that of the parameters."""
+
+def detect_together(
+    models: Models,
+    tgt: _Floats,
+    params: str,
+    tgt_normals: _Floats | None,
+    viewpoint: Sequence[Sequence[float]] | None,
+    measured: Sequence[_Floats] | None,
+    remove_plane: bool | None,
+    check_units: bool,
+    roi: tuple[_Floats, Sequence[float]] | None,
+    num_threads: int | None,
+    on_round: Callable[[str], object] | None,
+    own: Sequence[Callable[[_Floats, _Ints], dict[str, Callable[..., object]]]],
+) -> tuple[list[dict[str, Any]], list[list[int]], str, str, float]:
+    """Of each model as `detect`; [model, its pose] of all poses, best first; why it ended, as JSON and in words; seconds."""
 
 # Symmetries.
 

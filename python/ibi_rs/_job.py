@@ -14,6 +14,7 @@ from typing import Any
 import numpy.typing as npt
 
 from ibi_rs import io
+from ibi_rs._box import Box
 from ibi_rs._core import InputError, ParamsError
 from ibi_rs._inputs import Points
 from ibi_rs._model import Model
@@ -41,7 +42,7 @@ class Job:
         As in :func:`register` and :meth:`Model.detect`.
     tgt_frames, similarity : optional
         As in :func:`register`; only with ``corr``.
-    remove_plane : bool, optional
+    remove_plane, roi : optional
         As in :meth:`Model.detect`; only without ``corr``.
     num_threads : int, optional
         Default: what the batch gives each of its jobs.
@@ -74,6 +75,7 @@ class Job:
     similarity: npt.ArrayLike | None = None
     viewpoint: npt.ArrayLike | None = None
     remove_plane: bool | None = None
+    roi: Box | npt.ArrayLike | None = None
     num_threads: int | None = None
     max_instances: int | None = None
     timeout_s: float | None = None
@@ -82,7 +84,7 @@ class Job:
     def __post_init__(self) -> None:
         if not isinstance(self.model, Model):
             raise TypeError(f"model must be ibi_rs.Model, not {type(self.model).__name__}")
-        idle = ("tgt_frames", "similarity") if self.corr is None else ("remove_plane",)
+        idle = ("tgt_frames", "similarity") if self.corr is None else ("remove_plane", "roi")
         for name in idle:
             if getattr(self, name) is not None:
                 word = "without" if self.corr is None else "with"
@@ -132,7 +134,9 @@ class Job:
             "callback": callback,
         }
         if self.corr is None:
-            return self.model.detect(tgt, self.params, remove_plane=self.remove_plane, **options)
+            return self.model.detect(
+                tgt, self.params, remove_plane=self.remove_plane, roi=self.roi, **options
+            )
         options |= {"tgt_frames": self.tgt_frames, "similarity": self.similarity}
         return self.model.register(tgt, self.corr, self.params, **options)
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _precision
+from ibi_rs._box import Box, region
 from ibi_rs._inputs import Points, _num_threads, _scan_rows
 from ibi_rs._view import Viewpoint, _cameras
 
@@ -63,6 +64,7 @@ def scan_arguments(
     viewpoint: Viewpoint | None,
     remove_plane: bool | None,
     check_units: bool,
+    roi: Box | npt.ArrayLike | None,
     num_threads: int | None,
 ) -> dict[str, Any]:
     """Check what the core is to be told of a scan."""
@@ -78,5 +80,6 @@ def scan_arguments(
         "measured": measured,
         "remove_plane": None if remove_plane is None else bool(remove_plane),
         "check_units": bool(check_units),
+        "roi": region(roi),
         "num_threads": _num_threads(num_threads),
     }

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs import _core, _precision
+from ibi_rs._box import Box
 from ibi_rs._inputs import (
     Points,
     _correspondences,
@@ -24,7 +25,7 @@ from ibi_rs._inputs import (
 )
 from ibi_rs._matches import Matches, scan_arguments
 from ibi_rs._numbers import significant
-from ibi_rs._view import Viewpoint, _cameras
+from ibi_rs._view import Viewpoint, _cameras, _preset
 from ibi_rs.params import Params, _limited
 from ibi_rs.registration import Registration, Round, on_round
 from ibi_rs.stages import own_stages
@@ -246,6 +247,7 @@ class Model:
         viewpoint: Viewpoint | None = None,
         remove_plane: bool | None = None,
         check_units: bool = True,
+        roi: Box | npt.ArrayLike | None = None,
         num_threads: int | None = None,
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
@@ -256,7 +258,7 @@ class Model:
 
         Parameters
         ----------
-        tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads
+        tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads
             As in :meth:`detect`.
 
         Returns
@@ -270,7 +272,7 @@ class Model:
         InputError, TypeError, ValueError
             Those of :meth:`detect`.
         """
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
+        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
         return Matches._of(_core.correspond(self._core, **scan))
 
     def detect(
@@ -282,6 +284,7 @@ class Model:
         viewpoint: Viewpoint | None = None,
         remove_plane: bool | None = None,
         check_units: bool = True,
+        roi: Box | npt.ArrayLike | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -295,14 +298,15 @@ class Model:
             The scan, as in :func:`register`, in the unit of the model. Points that are not finite are left
             out.
         params : Params, optional
-            By default ``Params.single_view()`` with a viewpoint and ``Params()`` without one.
+            By default ``Params.single_view()`` with one to four viewpoints, else ``Params.many_views()``.
         tgt_normals : (N, 3) or (H, W, 3) array_like, optional
             Outwards. By default they are estimated, and face the viewpoint. A point whose normal is 0 or not
             finite gets that of its nearest point; where most are, they are refused.
-        viewpoint : (3,) array_like or View
+        viewpoint : (3,) or (E, 3) array_like, View or sequence of View
             Where the depth camera stood, in the frame of ``tgt``: ``[0, 0, 0]`` for most scans. Where ``tgt``
-            is not all that it measured, a :class:`View` of all. It may be left out where normals are given,
-            for scenes that are seen from all sides.
+            is not all that it measured, a :class:`View` of all. Of several cameras, or one that went about, the
+            places of all, or a View of each; what one of them sees was seen. It may be left out where normals
+            are given: then it is guessed from where the surfaces were seen.
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
             less than 2 % of the points lie behind it, as the viewpoint sees it.
@@ -310,6 +314,10 @@ class Model:
             Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts
             is the box around all points but the outermost hundredth on each side; fewer than 100 points tell
             nothing.
+        roi : Box or (2, 3) array_like, optional
+            What of the scan is looked into: a :class:`Box`, or the corners of the least and of the largest
+            coordinates of one along the axes of the scan, data units. What lies outside is neither searched
+            nor matched, but what was measured there still tells where there is nothing. By default all.
         num_threads, max_instances, callback
             As in :func:`register`.
         timeout_s : float, optional
@@ -340,9 +348,9 @@ class Model:
         >>> found = part.detect(trimesh.load("scan.ply"), viewpoint=[0, 0, 0])     # doctest: +SKIP
         """
         if params is None:
-            params = Params() if viewpoint is None else Params.single_view()
+            params = _preset(viewpoint)
         params = _limited(params, max_instances, timeout_s)
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, num_threads)
+        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
         own = params._own()
         raw = _core.detect(
             self._core,

@@ -54,10 +54,11 @@ def register(
         How alike the two descriptors of each correspondence are, on any scale; larger is better. Used by
         :class:`Nnsr`, which cannot do without. A good choice is 1 - d1 / d2, with d1 and d2 the distances to
         the nearest and to the second nearest descriptor.
-    viewpoint : (3,) array_like or View, optional
-        Where the depth camera stood, in the frame of ``tgt``; a :class:`View` adds all that it measured. With
-        normals that count and are oriented, only source points that it can see count in the overlap: they
-        face it, no other part of the model hides them, and nothing that it measured lies before them.
+    viewpoint : (3,) or (E, 3) array_like, View or sequence of View, optional
+        Where the depth camera stood, in the frame of ``tgt``, or several; a :class:`View` adds all that it
+        measured. With normals that count and are oriented, only source points that one of them can see count
+        in the overlap: they face it, no other part of the model hides them, and nothing that it measured lies
+        before them.
     num_threads : int, optional
         Default: the environment variable ``IBI_NUM_THREADS``, else the cores the process may use. More than
         four for each core, or eight, are not started. The result does not depend on it.

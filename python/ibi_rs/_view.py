@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ibi_rs import _core
 from ibi_rs._inputs import _eyes, _floats, _frozen, _number, _rigid, _scan_rows, _viewpoint
+from ibi_rs.params import Params
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,7 +141,19 @@ def _cameras(
     if isinstance(views, (list, tuple)) and any(isinstance(view, View) for view in views):
         for view in views:
             if not isinstance(view, View):
-                raise TypeError(f"viewpoint: beside a View there can only be others, not {type(view).__name__}")
+                raise TypeError(
+                    f"viewpoint: beside a View there can only be others, not {type(view).__name__}"
+                )
         return [view.eye.tolist() for view in views], [view.points for view in views]
     eyes = _eyes(value)
     return eyes.tolist(), None
+
+
+FEW_VIEWPOINTS = 4
+"""A scan of more cameras is one that was walked around."""
+
+
+def _preset(viewpoint: Viewpoint | None) -> Params:
+    """Return the parameters that fit what is known of the cameras."""
+    eyes, _ = _cameras(viewpoint)
+    return Params.single_view() if eyes and len(eyes) <= FEW_VIEWPOINTS else Params.many_views()

@@ -179,6 +179,15 @@ class Params:
         """
         return cls.from_dict(json.loads(_core.preset("single_view")))
 
+    @classmethod
+    def many_views(cls: type[_P]) -> _P:
+        """Return what fits a scene seen from many places: by a camera that went about, or from all sides.
+
+        Give the normals of both clouds, oriented, and where the camera stood, if that is known.
+        :meth:`single_view`, with more patience: large scenes hold much that looks like a part.
+        """
+        return cls.from_dict(json.loads(_core.preset("many_views")))
+
     def replace(self: _P, **changes: Any) -> _P:
         """Return a copy with ``changes``; unknown names raise TypeError."""
         return dataclasses.replace(self, **changes)

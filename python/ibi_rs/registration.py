@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -12,6 +12,7 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
+from ibi_rs._core import InputError
 from ibi_rs._numbers import lengths, significant
 from ibi_rs.params import Params
 from ibi_rs.symmetries import Symmetries
@@ -87,18 +88,25 @@ class Rejected:
     objection : str
         What speaks most against it: ``contradicted`` (the camera looked through it), ``runs_on`` (the scene
         goes on where its faces should end), ``overrun`` (points around it carry its surface on), ``slips``
-        (moved a little, it fits as well), ``loose`` (its surface lies off what was measured).
+        (moved a little, it fits as well), ``loose`` (its surface lies off what was measured), ``outdone``
+        (better poses of other models explain too many of its points: :class:`Models`).
     round : int
         The round that found it.
-    measures : Measures
-        What was measured of it.
+    measures : Measures or None
+        What was measured of it close up; None where an outdone one was not looked at so.
+    model : int
+        Index of its model, 0 where there is but one.
+    model_name : str or None
+        Its name in :class:`Models`.
     """
 
     target_from_source: npt.NDArray[np.float64] = field(repr=False)
     score: float
     objection: str
     round: int
-    measures: Measures
+    measures: Measures | None
+    model: int = 0
+    model_name: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +143,10 @@ class Pose:
         What was measured of it close up, where the scene is seen from one side and judged by
         :class:`Evidence`; the
         score is theirs then.
+    model : int
+        Index of its model, 0 where there is but one.
+    model_name : str or None
+        Its name in :class:`Models`.
     """
 
     target_from_source: npt.NDArray[np.float64]
@@ -147,6 +159,8 @@ class Pose:
     inliers: npt.NDArray[np.int64] = field(repr=False)
     round: int
     measures: Measures | None = field(default=None, repr=False)
+    model: int = 0
+    model_name: str | None = None
 
     @property
     def transformation(self) -> npt.NDArray[np.float64]:
@@ -182,8 +196,9 @@ class Pose:
     def _shown(self, scale: float) -> str:
         """In a line, with lengths that are rounded by a scale."""
         t = ", ".join(lengths(self.target_from_source[:3, 3], scale))
+        name = "" if self.model_name is None else f"{self.model_name!r}, "
         return (
-            f"Pose(score={self.score:.3f}, overlap={self.overlap:.3f}, num_inliers={self.num_inliers}, "
+            f"Pose({name}score={self.score:.3f}, overlap={self.overlap:.3f}, num_inliers={self.num_inliers}, "
             f"inlier_rmse={significant(self.inlier_rmse, 3)}, translation=[{t}])"
         )
 
@@ -293,6 +308,10 @@ class StopReason:
     value: float | None = None
     threshold: float | None = None
 
+    @classmethod
+    def _of(cls, raw: str, message: str) -> StopReason:
+        return cls(message=message, **json.loads(raw))
+
     def __str__(self) -> str:
         return self.message
 
@@ -344,6 +363,8 @@ class Registration(Sequence[Pose]):
         What passed validation and was given up when it was looked at close up, best score first; at most 100.
     warnings : tuple of str
         What is doubtful about the input, one line each: :meth:`Model.detect` looks for it. Mostly empty.
+    models : tuple of str
+        Names of the models, if they are of :class:`Models`; else empty.
     """
 
     def __init__(
@@ -358,6 +379,7 @@ class Registration(Sequence[Pose]):
         params: Params,
         rejected: Sequence[Rejected] = (),
         warnings: Sequence[str] = (),
+        parts: Mapping[str, Registration] | None = None,
     ) -> None:
         self.poses = tuple(poses)
         self.labels = labels
@@ -368,22 +390,112 @@ class Registration(Sequence[Pose]):
         self.params = params
         self.rejected = tuple(rejected)
         self.warnings = tuple(warnings)
+        self._parts = dict(parts or {})
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the models, if they are of :class:`Models`; else empty."""
+        return tuple(self._parts)
+
+    def of(self, model: int | str) -> Registration:
+        """Return what was found of one model.
+
+        Parameters
+        ----------
+        model : int or str
+            Its index, or its name in :class:`Models`.
+
+        Returns
+        -------
+        Registration
+            Its ``labels`` and ``inliers`` are rows of the correspondences of that model alone.
+
+        Raises
+        ------
+        IndexError, KeyError
+            There is no such model.
+        """
+        if isinstance(model, str):
+            if model not in self._parts:
+                names = ", ".join(map(repr, self._parts)) or "none with a name"
+                raise KeyError(f"model {model!r}; there are {names}")
+            return self._parts[model]
+        return (tuple(self._parts.values()) or (self,))[model]
+
+    @classmethod
+    def _of_part(cls, raw: dict[str, Any], params: Params, model: int, name: str) -> Registration:
+        """Dress what the core gives of one model of several."""
+        if raw["resolution_set"] != params.resolution:
+            params = params.replace(resolution=raw["resolution_set"])
+        found = cls._of(raw, params)
+        found.poses = tuple(replace(pose, model=model, model_name=name) for pose in found.poses)
+        found.rejected = tuple(replace(pose, model=model, model_name=name) for pose in found.rejected)
+        return found
+
+    @classmethod
+    def _of_parts(
+        cls,
+        names: Sequence[str],
+        parts: Sequence[Registration],
+        ranking: Sequence[Sequence[int]],
+        params: Params,
+        stop_reason: StopReason,
+        total_s: float,
+    ) -> Registration:
+        """Put several models together, their poses in the order of `ranking`: pairs of model and pose."""
+        starts = np.cumsum([0, *(len(part.labels) for part in parts)])
+        place = {(model, pose): at for at, (model, pose) in enumerate(ranking)}
+        poses, labels = [], []
+        for model, pose in ranking:
+            found = parts[model].poses[pose]
+            poses.append(replace(found, inliers=found.inliers + starts[model]))
+        for model, part in enumerate(parts):
+            # -1, of none, is the last of them.
+            new = np.array([*(place[model, pose] for pose in range(len(part))), -1], dtype=np.int32)
+            labels.append(new[part.labels])
+        rejected = sorted((one for part in parts for one in part.rejected), key=lambda one: -one.score)
+        seconds = {
+            name: sum(getattr(part.timings, name) for part in parts)
+            for name in (field.name for field in fields(Timings))
+        }
+        texts = dict.fromkeys(text for part in parts for text in part.warnings)
+        about = {
+            text: [name for name, part in zip(names, parts, strict=True) if text in part.warnings]
+            for text in texts
+        }
+        rounds = [part._rounds[1:-1] for part in parts if part._rounds != "[]"]
+        return cls(
+            poses,
+            labels=np.concatenate(labels),
+            rounds=f"[{','.join(rounds)}]",
+            stop_reason=stop_reason,
+            timings=Timings(**{**seconds, "total_s": total_s}),
+            resolution=min(part.resolution for part in parts),
+            params=params if len(parts) > 1 else parts[0].params,
+            rejected=rejected,
+            warnings=[
+                text if len(of) == len(parts) else f"{', '.join(of)}: {text}" for text, of in about.items()
+            ],
+            parts=dict(zip(names, parts, strict=True)),
+        )
 
     @classmethod
     def _of(cls, raw: dict[str, Any], params: Params) -> Registration:
         """Dress what the core gives."""
         measures = [of and Measures._of(of) for of in json.loads(raw["measures"])]
-        columns = [raw[field.name] for field in fields(Pose) if field.name != "measures"]
+        columns = [
+            raw[field.name] for field in fields(Pose) if field.name in raw and field.name != "measures"
+        ]
         rejected = zip(raw["rejected_poses"], json.loads(raw["rejected"]), strict=True)
         return cls(
             list(map(Pose, *columns, measures)),
             rejected=[
-                Rejected(pose, score, objection, found_in, Measures._of(of))
+                Rejected(pose, score, objection, found_in, of and Measures._of(of))
                 for pose, (score, objection, found_in, of) in rejected
             ],
             labels=raw["labels"],
             rounds=raw["rounds"],
-            stop_reason=StopReason(message=raw["stop_message"], **json.loads(raw["stop_reason"])),
+            stop_reason=StopReason._of(raw["stop_reason"], raw["stop_message"]),
             timings=Timings(**json.loads(raw["timings"])),
             resolution=raw["resolution"],
             params=params,
@@ -395,10 +507,23 @@ class Registration(Sequence[Pose]):
         """One entry per round that was played to its end."""
         return tuple(Round._from_dict(data) for data in json.loads(self._rounds))
 
-    def canonical(self, symmetries: Symmetries, reference: npt.ArrayLike | None = None) -> Registration:
-        """Return the same with each pose as :meth:`Pose.canonical` gives it."""
+    def canonical(
+        self, symmetries: Symmetries | Sequence[Symmetries], reference: npt.ArrayLike | None = None
+    ) -> Registration:
+        """Return the same with each pose as :meth:`Pose.canonical` gives it.
+
+        Of :class:`Models` the symmetries of each.
+        """
+        of = [symmetries] if isinstance(symmetries, Symmetries) else list(symmetries)
+        num = max(1, len(self._parts))
+        if len(of) != num:
+            raise InputError(f"symmetries: there are {len(of)} of {num} models")
         turned = copy(self)
-        turned.poses = tuple(pose.canonical(symmetries, reference) for pose in self)
+        turned.poses = tuple(pose.canonical(of[pose.model], reference) for pose in self)
+        turned._parts = {}
+        for one, (name, part) in zip(of, self._parts.items(), strict=False):
+            turned._parts[name] = copy(part)
+            turned._parts[name].poses = tuple(pose.canonical(one, reference) for pose in part)
         return turned
 
     def __len__(self) -> int:

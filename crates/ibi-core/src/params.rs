@@ -205,6 +205,15 @@ impl Params {
         }
     }
 
+    /// For a scene that was seen from many places: by a camera that went about, or from all sides. Give the normals of both clouds,
+    /// oriented, and where the camera stood, if that is known.
+    ///
+    /// [`Self::single_view`], with more patience: large scenes hold much that looks like a part.
+    #[must_use]
+    pub fn many_views() -> Self {
+        Self { max_rejections: Some(2000), ..Self::single_view() }
+    }
+
     /// When points agree.
     pub(crate) fn tolerances(&self) -> Tolerances {
         let Self { t_he_pr, d_op_pr, min_normal_cos, oriented_normals, .. } = *self;

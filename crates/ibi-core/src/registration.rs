@@ -17,7 +17,8 @@ pub struct Registration {
     pub poses: Vec<Pose>,
     /// For each correspondence the instance (index into `poses`) it fits best with a residual below `t_he`.
     pub labels: Vec<Option<u32>>,
-    /// What passed validation and failed when it was looked at close up, best score first; at most 100.
+    /// What passed validation and failed when it was looked at close up, or beside poses of other models, best score first; at most
+    /// 100.
     pub rejected: Vec<Rejected>,
     /// One entry per round that was played to its end.
     pub rounds: Vec<Round>,
@@ -47,6 +48,35 @@ impl Registration {
             timings: Timings { prepare_s: total_s, total_s, ..Timings::default() },
             resolution,
         }
+    }
+}
+
+/// Rejected poses that are told of.
+pub(crate) const MAX_REJECTED: usize = 100;
+
+impl Registration {
+    /// Rejects poses that better ones of other models outdo; no correspondence is theirs any more.
+    pub(crate) fn drop_outdone(&mut self, is_outdone: &[bool]) {
+        if !is_outdone.contains(&true) {
+            return;
+        }
+        let mut kept = 0..;
+        let new: Vec<Option<u32>> =
+            is_outdone.iter().map(|&is_outdone| if is_outdone { None } else { kept.next() }).collect();
+        for label in &mut self.labels {
+            *label = label.and_then(|label| new[label as usize]);
+        }
+        let mut of = new.iter();
+        let outdone = self.poses.extract_if(.., |_| of.next().is_some_and(Option::is_none));
+        self.rejected.extend(outdone.map(|pose| Rejected {
+            target_from_source: pose.target_from_source,
+            score: pose.score,
+            objection: Objection::Outdone,
+            measures: pose.measures,
+            round: pose.round,
+        }));
+        self.rejected.sort_by(|a, b| b.score.total_cmp(&a.score));
+        self.rejected.truncate(MAX_REJECTED);
     }
 }
 
@@ -92,8 +122,8 @@ pub struct Rejected {
     pub score: f64,
     /// What speaks most against it.
     pub objection: Objection,
-    /// What was measured of it.
-    pub measures: Measures,
+    /// What was measured of it close up, if it was.
+    pub measures: Option<Measures>,
     /// The round that found it.
     pub round: u32,
 }

@@ -19,7 +19,8 @@ use crate::runs;
 use crate::symmetries::Symmetries;
 
 pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<Model>()
+    m.add_class::<Model>()?;
+    m.add_class::<Models>()
 }
 
 /// See `ibi_rs.Model`, which is in front of it.
@@ -110,5 +111,18 @@ impl Model {
         in_pool(py, num_threads, |interrupt| {
             self.0.source().diameter(interrupt).ok_or(FeatureError::Interrupted)
         })
+    }
+}
+
+/// See `ibi_rs.Models`, which is in front of it.
+#[pyclass(frozen, module = "ibi_rs._core")]
+pub(crate) struct Models(pub(crate) detection::Models);
+
+#[pymethods]
+impl Models {
+    #[new]
+    fn new(parts: Vec<(String, Py<Model>)>) -> PyResult<Self> {
+        let parts = parts.into_iter().map(|(name, model)| (name, Arc::clone(&model.get().0))).collect();
+        Ok(Self(detection::Models::new(parts).or_py_err()?))
     }
 }

@@ -39,6 +39,7 @@ fn preset(name: &str) -> PyResult<String> {
         "paper_synthetic" => Params::paper_synthetic(),
         "paper_real" => Params::paper_real(),
         "single_view" => Params::single_view(),
+        "many_views" => Params::many_views(),
         _ => return Err(ParamsError::new_err(format!("no preset is called {name:?}"))),
     };
     to_json(&params)

@@ -1,6 +1,6 @@
 //! The measures of a pose once more, as their definitions read: every point against every other.
 
-use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+use nalgebra::{Isometry3, Matrix6, Point3, Vector3, Vector6};
 
 /// What an eye says of a point on a surface, in the words of the definition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -120,4 +120,27 @@ pub fn roughness(points: &[Point3<f64>], far: impl Fn(&Point3<f64>) -> f64) -> f
     );
     let least = offsets.svd(false, false).singular_values.min();
     least / 3.0
+}
+
+/// Rows of a scan that a surface explains once it has been moved: the nearest of its points that one of the eyes can see, or of all
+/// without eyes, is within reach across its tangent plane, and no farther than the diagonal of both reaches.
+#[must_use]
+pub fn explained(
+    (points, normals): (&[Point3<f64>], &[Vector3<f64>]),
+    pose: &Isometry3<f64>,
+    eyes: &[Point3<f64>],
+    least_cos: f64,
+    scan: &[Point3<f64>],
+    [across, aside]: [f64; 2],
+) -> Vec<u32> {
+    let moved: Vec<_> = points.iter().zip(normals).map(|(p, n)| (pose * p, pose * n)).collect();
+    let sees =
+        |eye: &Point3<f64>, (p, n): &(Point3<f64>, Vector3<f64>)| (eye - p).normalize().dot(n) > least_cos;
+    let seen = moved.iter().filter(|at| eyes.is_empty() || eyes.iter().any(|eye| sees(eye, at)));
+    let seen: Vec<_> = seen.collect();
+    let is_explained = |q: &Point3<f64>| {
+        let nearest = seen.iter().min_by(|a, b| (q - a.0).norm().total_cmp(&(q - b.0).norm()));
+        nearest.is_some_and(|(p, n)| (q - p).norm() <= across.hypot(aside) && (q - p).dot(n).abs() <= across)
+    };
+    (0..).zip(scan).filter(|(_, q)| is_explained(q)).map(|(row, _)| row).collect()
 }

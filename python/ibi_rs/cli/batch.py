@@ -29,6 +29,7 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    Crop,
     FromAllSides,
     MaxInstances,
     ModelFile,
@@ -64,6 +65,7 @@ def batch(
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    crop: Crop = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
@@ -116,7 +118,7 @@ def batch(
         misused("--skip-existing looks into the folder of -o; give it")
     chosen = chosen_params(preset, params)
     search = Search(
-        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries
+        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries, crop
     )
     start = time.perf_counter()
     targets = _targets(scenes, output)

@@ -128,7 +128,7 @@ def _time_files(
     sight = search.sight(scan.normals, scan.viewpoint)
     matches = part.correspond(scan.points, **sight, num_threads=threads)
     watch.lap("match")
-    default = ibi.Params() if search.from_all_sides else ibi.Params.single_view()
+    default = ibi.Params.many_views() if search.from_all_sides else ibi.Params.single_view()
     found = part.register(
         matches.tgt,
         matches.corr,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
@@ -48,18 +49,21 @@ def try_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path | None])
 def show(found: ibi.Registration, seconds: float) -> None:
     """Print a table of the poses."""
     table = Table(box=None, pad_edge=False)
-    for column in ("", "score", "overlap", "inliers", "x", "y", "z", "rx", "ry", "rz"):
-        table.add_column(column, justify="right", no_wrap=True)
+    is_of_several = len(found.models) > 1
+    for column in ("", *["part"] * is_of_several, "score", "overlap", "inliers", *"xyz", "rx", "ry", "rz"):
+        table.add_column(column, justify="left" if column == "part" else "right", no_wrap=True)
     for number, pose in enumerate(found):
         place = lengths(pose.target_from_source[:3, 3], found.resolution)
         turn = [f"{x:.1f}" for x in np.degrees(_rotation_vector(pose.target_from_source[:3, :3]))]
         quality = [f"{pose.score:.2f}", f"{pose.overlap:.2f}", str(pose.num_inliers)]
-        table.add_row(str(number), *quality, *place, *turn)
+        name = [escape(str(pose.model_name))] if is_of_several else []
+        table.add_row(str(number), *name, *quality, *place, *turn)
     if len(found):
         print_table(table)
         out.print("x, y, z in the unit of the scene; rx, ry, rz: rotation vector, degrees", style="dim")
+    counts = ", ".join(f"{len(found.of(name))} {name}" for name in found.models)
     out.print(
-        f"{len(found)} found in {seconds:.2f} s; stopped by {found.stop_reason}",
+        f"{len(found)} found{f' ({counts})' if is_of_several else ''} in {seconds:.2f} s; stopped by {found.stop_reason}",
         highlight=False,
         markup=False,
     )
@@ -99,8 +103,8 @@ def as_dict(
     found: ibi.Registration,
     seconds: float,
     *,
-    model: Path,
-    model_sha256: str,
+    model: Path | Sequence[Path],
+    model_sha256: str | Sequence[str],
     scene: Path,
     scene_sha256: str,
     search: dict[str, Any],
@@ -108,13 +112,14 @@ def as_dict(
     """Bring the poses into the form of the JSON files, with all that they depend on."""
     return {
         "ibi_rs": ibi.__version__,
-        "model": str(model),
+        "model": str(model) if isinstance(model, Path) else list(map(str, model)),
         "model_sha256": model_sha256,
         "scene": str(scene),
         "scene_sha256": scene_sha256,
         "search": search,
         "poses": [
             {
+                **({"model": pose.model, "model_name": pose.model_name} if len(found.models) > 1 else {}),
                 "target_from_source": pose.target_from_source.tolist(),
                 "score": pose.score,
                 "overlap": pose.overlap,
@@ -137,14 +142,13 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def write_bop(
-    path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], obj_id: int = 1
-) -> None:
-    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds."""
+def write_bop(path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], *obj_ids: int) -> None:
+    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds; an obj_id for all or for each."""
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["scene_id", "im_id", "obj_id", "score", "R", "t", "time"])
-        for scene_id, im_id, poses, scores, seconds in images:
+        obj_ids = obj_ids if len(obj_ids) == len(images) else (obj_ids or (1,)) * len(images)
+        for obj_id, (scene_id, im_id, poses, scores, seconds) in zip(obj_ids, images, strict=True):
             for pose, score in zip(poses, scores, strict=True):
                 parts = pose[:3, :3], 1000 * pose[:3, 3]
                 numbers = (" ".join(f"{x:.9g}" for x in part.ravel()) for part in parts)

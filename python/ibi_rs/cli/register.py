@@ -22,9 +22,10 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    Crop,
     FromAllSides,
     MaxInstances,
-    ModelFile,
+    ModelFiles,
     ParamsFile,
     Preset,
     RemovePlane,
@@ -50,7 +51,7 @@ from .terminal import (
 
 @command()
 def register(
-    model: ModelFile,
+    models: ModelFiles,
     scene: SceneFile,
     corr: Annotated[
         Path | None,
@@ -62,6 +63,7 @@ def register(
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    crop: Crop = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
@@ -88,6 +90,11 @@ def register(
 
     With your own matches:         ibi register part.npy scan.npy --corr m.npy
 
+    Several parts in one scan:     ibi register bolt.stl nut.stl scan.ply
+
+    Of several parts each MODEL is looked for, and then all poses compete for
+    what was measured. --bop numbers them from 1 in the order of the command.
+
     With your own matches the normals of both files count, where both have them.
     If you give the --viewpoint then, too, it is a depth scan, and the preset
     single_view fits; without it, default does.
@@ -96,14 +103,20 @@ def register(
     2 if the command line is, 130 after Ctrl-C.
     """
     start = time.perf_counter()
+    model = models[0]
     if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
         misused("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
+    if corr is not None and crop is not None:
+        misused("--corr brings the matches: --crop has no say then")
+    if len(models) > 1:
+        _try_several(corr, plot, rerun, symmetries)
     chosen = chosen_params(preset, params)
     search = Search(
-        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries
+        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries, crop
     )
     outputs = {"--output": output, "--bop": bop, "--plot": plot, "--rerun": rerun}
-    try_outputs(outputs, {"MODEL": model, "SCENE": scene, "--corr": corr, "--params": params})
+    inputs = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
+    try_outputs(outputs, {**inputs, "SCENE": scene, "--corr": corr, "--params": params})
     options = search.limits(threads)
     pairs: Any = None
     with err.status("reading") as status:
@@ -114,10 +127,12 @@ def register(
         else:
             scan = io.read_scan(scene)
             tgt, sight = scan.points, search.sight(scan.normals, scan.viewpoint)
-            part = search.model(model, threads)
+            parts = [search.model(one, threads) for one in models]
+            part = parts[0]
             src, held = part.points, part.symmetries
             status.update("detecting")
-            found = part.detect(
+            kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
+            found = kinds.detect(
                 tgt,
                 chosen,
                 **sight,
@@ -125,24 +140,29 @@ def register(
                 **options,
             )
     seconds = time.perf_counter() - start
-    if not held.is_none:
-        found = found.canonical(held)
+    of_all = [held] if corr is not None else [one.symmetries for one in parts]
+    if not all(one.is_none for one in of_all):
+        found = found.canonical(of_all)
     for warning in found.warnings:
         warn(warning)
     show(found, seconds)
-    if not held.is_none:
-        out.print(f"modulo {held!r}", style="dim", highlight=False, markup=False)
+    for path, one in zip(models, of_all, strict=True):
+        if not one.is_none:
+            name = f"{path.name} " if len(models) > 1 else ""
+            out.print(f"{name}modulo {one!r}", style="dim", highlight=False, markup=False)
     if output is not None:
         files: dict[str, Any] = {
-            "model": model,
-            "model_sha256": sha256(model),
+            "model": model if len(models) == 1 else models,
+            "model_sha256": sha256(model) if len(models) == 1 else [sha256(one) for one in models],
             "scene": scene,
             "scene_sha256": sha256(scene),
         }
-        recorded = search.recorded(held) | ({} if corr is None else {"corr": str(corr)})
+        recorded = search.recorded(*of_all) | ({} if corr is None else {"corr": str(corr)})
         write_json(output, as_dict(found, seconds, **files, search=recorded))
     if bop is not None:
-        write_bop(bop, [(0, 0, np.asarray(found), [pose.score for pose in found], seconds)])
+        of_parts = [found.of(i) for i in range(len(models))]
+        rows = [(0, 0, np.asarray(one), [pose.score for pose in one], seconds) for one in of_parts]
+        write_bop(bop, rows, *range(1, len(models) + 1))
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes
@@ -154,6 +174,24 @@ def register(
         ibi.viz.record(tgt, src, found, rerun, corr=pairs)
     if len(found) == 0:
         raise typer.Exit(FOUND_NOTHING)
+
+
+def _try_several(corr: Path | None, plot: Path | None, rerun: Path | None, symmetries: str) -> None:
+    """Refuse what has no meaning for several parts."""
+    for name, value in (("--corr", corr), ("--plot", plot), ("--rerun", rerun)):
+        if value is not None:
+            misused(f"{name} is of one MODEL; there are several")
+    if symmetries not in ("find", "none"):
+        misused("--symmetries of several MODELs are find or none")
+
+
+def _names(models: list[Path]) -> list[str]:
+    """Name parts by their files, in short if that tells them apart."""
+    stems = [path.stem for path in models]
+    names = stems if len(set(stems)) == len(stems) else [str(path) for path in models]
+    if len(set(names)) < len(names):
+        misused("MODEL: one file is given twice")
+    return names
 
 
 def _with_matches(

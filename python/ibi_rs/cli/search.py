@@ -21,12 +21,19 @@ SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has sever
 PRESETS = {
     "default": ibi.Params,
     "single_view": ibi.Params.single_view,
+    "many_views": ibi.Params.many_views,
     "paper_synthetic": ibi.Params.paper_synthetic,
     "paper_real": ibi.Params.paper_real,
 }
 
 ModelFile = Annotated[
     Path, typer.Argument(help="Mesh of the part: STL, PLY, OBJ, OFF or GLB.", metavar="MODEL")
+]
+ModelFiles = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Mesh of the part, or of each of several: STL, PLY, OBJ, OFF or GLB.", metavar="MODEL"
+    ),
 ]
 SceneFile = Annotated[
     Path, typer.Argument(help="Scan: PLY, PCD, LAS, XYZ, CSV, NPY ... in the same unit.", metavar="SCENE")
@@ -37,6 +44,14 @@ Viewpoint = Annotated[
         help="Where the depth camera stood, in the frame of SCENE: X,Y,Z or three numbers. "
         "Default: what a PCD file says, else 0,0,0.",
         metavar="X Y Z",
+    ),
+]
+Crop = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    typer.Option(
+        help="Look only into a box along the axes of SCENE: its least corner and its largest one, "
+        "x0,y0,z0,x1,y1,z1 or six numbers.",
+        metavar="X0 Y0 Z0 X1 Y1 Z1",
     ),
 ]
 FromAllSides = Annotated[
@@ -76,6 +91,7 @@ class Search:
     max_instances: int | None
     timeout_s: float | None
     symmetries: str = "none"
+    crop: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         """Refuse now what would be refused once the files are read."""
@@ -83,6 +99,10 @@ class Search:
             misused("--from-all-sides has no --viewpoint; leave one of them out")
         if self.viewpoint is not None and not np.isfinite(self.viewpoint).all():
             misused("--viewpoint must be three finite numbers")
+        if self.crop is not None and not (
+            np.isfinite(self.crop).all() and np.less(self.crop[:3], self.crop[3:]).all()
+        ):
+            misused("--crop must be six finite numbers, the first three each below one of the last three")
         if self.voxel is not None and not 0 < self.voxel < np.inf:
             misused(f"--voxel is {self.voxel:g}; it must be above 0 and finite")
         if self.timeout_s is not None and not 0 <= self.timeout_s <= 1e9:
@@ -104,24 +124,27 @@ class Search:
             "tgt_normals": normals if self.from_all_sides else None,
             "viewpoint": None if self.from_all_sides else self.viewpoint or place,
             "remove_plane": self.remove_plane,
+            "roi": None if self.crop is None else np.reshape(self.crop, (2, 3)),
         }
 
     def params_for(self, default: ibi.Params | None = None) -> ibi.Params:
         """Return those that a run will have: the chosen ones, or those that fit the scene, and the limits."""
         if default is None:
-            default = ibi.Params() if self.from_all_sides else ibi.Params.single_view()
+            default = ibi.Params.many_views() if self.from_all_sides else ibi.Params.single_view()
         limits = {"max_instances": self.max_instances, "timeout_s": self.timeout_s}
         given = {name: value for name, value in limits.items() if value is not None}
         return (self.params or default).replace(**given)
 
-    def recorded(self, symmetries: ibi.Symmetries) -> dict[str, Any]:
+    def recorded(self, *symmetries: ibi.Symmetries) -> dict[str, Any]:
         """Return what a result depends on beside the parameters and the files, for the JSON."""
+        of = [held.to_bop() for held in symmetries]
         return {
             "viewpoint": None if self.viewpoint is None else list(self.viewpoint),
             "from_all_sides": self.from_all_sides,
             "voxel": self.voxel,
             "remove_plane": self.remove_plane,
-            "symmetries": symmetries.to_bop(),
+            "symmetries": of[0] if len(of) == 1 else of,
+            "crop": None if self.crop is None else list(self.crop),
         }
 
     def limits(self, num_threads: int | None) -> dict[str, Any]:

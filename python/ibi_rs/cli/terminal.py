@@ -62,6 +62,9 @@ class _Group(TyperGroup):
             return super().invoke(ctx)
 
 
+_NUMBERS = {"--viewpoint": 3, "--crop": 6}
+
+
 class _Command(TyperCommand):
     """Takes `--viewpoint 0,0,0` for `--viewpoint 0 0 0`."""
 
@@ -70,8 +73,8 @@ class _Command(TyperCommand):
         wanted = 0  # numbers that the option still lacks
         for argument in args:
             name, equals, value = argument.partition("=")
-            if name == "--viewpoint":
-                split, wanted = [*split, name], 3
+            if name in _NUMBERS:
+                split, wanted = [*split, name], _NUMBERS[name]
                 argument = value if equals else ""
             elif not wanted:
                 split.append(argument)

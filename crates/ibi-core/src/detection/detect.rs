@@ -6,19 +6,22 @@ use nalgebra::{Point3, Vector3};
 
 use super::bodies::across;
 use super::doubts::{self, Doubt};
-use super::model::{DIM, Model, describe};
-use super::scan::{Measured, Prepared, Setting, standing};
+use super::model::{DIM, Model};
+use super::roi::Roi;
+use super::scan::standing;
+use super::shared::Shared;
 use super::{DetectionError, Origin, Run, VOXELS_PER_SPACING, sides};
-use crate::error::Argument;
 use crate::features::{Descriptors, FeatureError, Matches, Matching, match_features};
 use crate::interrupt::Interrupt;
 use crate::kernels::par::Pool;
 use crate::params::Params;
 use crate::registrar::{Observer, Registrar};
 use crate::registration::Registration;
-use crate::scene::Correspondences;
-use crate::scene::{Cloud, Measurement, check_points};
+use crate::scene::{Cloud, Correspondences};
 use crate::stop::StopReason;
+
+/// A scan of more cameras is one that was walked around.
+const FEW_VIEWPOINTS: usize = 4;
 
 /// Nearest model points that each scene point is joined to: walls and edges repeat on a part.
 const PER_POINT: usize = 4;
@@ -33,7 +36,8 @@ const MIN_POINTS: usize = 3;
 /// How a model is looked for in a scan.
 #[derive(Debug, Clone)]
 pub struct Detect {
-    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with a viewpoint, else the default.
+    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with one to four viewpoints, else
+    /// [`Params::many_views`].
     pub params: Option<Params>,
     /// Whether the plane with most points is taken away. `None`: where it looks like a table, with less than 2 % of the
     /// points behind it as the viewpoint sees it.
@@ -41,13 +45,26 @@ pub struct Detect {
     /// Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts is the box around
     /// all points but the outermost hundredth on each side; fewer than 100 points tell nothing.
     pub check_units: bool,
+    /// What of the scan is looked into; `None`: all of it.
+    pub roi: Option<Roi>,
     /// Threads, and how to end it.
     pub run: Run,
 }
 
 impl Default for Detect {
     fn default() -> Self {
-        Self { params: None, remove_plane: None, check_units: true, run: Run::default() }
+        Self { params: None, remove_plane: None, check_units: true, roi: None, run: Run::default() }
+    }
+}
+
+impl Detect {
+    /// Those that were given, or those that fit the scan; checked.
+    pub(super) fn params_for(&self, scan: &Cloud<'_>) -> Result<Params, DetectionError> {
+        let is_few = (1..=FEW_VIEWPOINTS).contains(&scan.viewpoints.len());
+        let preset = || if is_few { Params::single_view() } else { Params::many_views() };
+        let params = self.params.clone().unwrap_or_else(preset);
+        params.validate()?;
+        Ok(params)
     }
 }
 
@@ -82,6 +99,10 @@ pub struct Detection {
 }
 
 impl Detection {
+    pub(super) fn without_scan(registration: Registration, params: Params) -> Self {
+        Self { registration, scan: None, params, of_units: None }
+    }
+
     /// What the result is to be mistrusted for.
     pub fn doubts(&self) -> impl Iterator<Item = &Doubt> {
         self.scan.iter().flat_map(|scan| &scan.doubts).chain(&self.of_units)
@@ -114,20 +135,38 @@ impl Model {
         observer: &mut dyn Observer,
     ) -> Result<Detection, DetectionError> {
         let start = Instant::now();
-        let mut params = options.params.clone().unwrap_or_else(|| {
-            if scan.viewpoints.is_empty() { Params::default() } else { Params::single_view() }
+        let params = options.params_for(scan)?;
+        self.check()?;
+        let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
+        let pool = Pool::new(options.run.num_threads)?;
+        let shared = pool.install(|| {
+            Shared::new(scan, options, params.oriented_normals, || Ok(self.diameter(&interrupt)?))
         });
-        params.validate()?;
+        drop(pool);
+        match shared {
+            Ok(mut shared) => self.search(&mut shared, params, start, set_up, observer),
+            Err(error) if error.is_interrupted() => Ok(self.no_time(params, start, &interrupt)),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The same, in a scan that other models are looked for in as well. The time that `params` allow counts from `start`.
+    pub(super) fn search(
+        &self,
+        shared: &mut Shared<'_>,
+        mut params: Params,
+        start: Instant,
+        set_up: impl FnOnce(Registrar<'static>, &MatchedScan) -> Registrar<'static>,
+        observer: &mut dyn Observer,
+    ) -> Result<Detection, DetectionError> {
+        let options = shared.options;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         // The registrar has a pool of its own, which takes the threads of this one over.
         let pool = || Pool::new(options.run.num_threads);
-        let matched = pool()?.install(|| self.matched(scan, options, &interrupt));
-        let (matched, measured) = match matched {
+        let matched = pool()?.install(|| self.matched(shared, &interrupt));
+        let matched = match matched {
             Ok(matched) => matched,
-            Err(error) if error.is_interrupted() => {
-                let registration = self.nothing(&params, start, &interrupt);
-                return Ok(Detection { registration, scan: None, params, of_units: None });
-            }
+            Err(error) if error.is_interrupted() => return Ok(self.no_time(params, start, &interrupt)),
             Err(error) => return Err(error),
         };
         if matched.voxel > self.voxel() && params.resolution.is_none() {
@@ -140,7 +179,7 @@ impl Model {
             let timeout_s = params.timeout_s.map(|limit| (limit - spent_s).max(0.0));
             let limited = Params { timeout_s, ..params.clone() };
             let registrar = options.run.registrar(Registrar::of(self.source().clone()).params(limited));
-            let (target, correspondences) = matched.input(scan, &measured);
+            let (target, correspondences) = matched.input(shared);
             let registrar = set_up(registrar, &matched);
             let mut found = registrar.register_observed(&target, &correspondences, observer)?;
             if let StopReason::Timeout { value, threshold } = &mut found.stop_reason {
@@ -150,8 +189,9 @@ impl Model {
             found
         };
         let is_over = registration.stop_reason.is_from_outside();
-        let of_units = if registration.poses.is_empty() && measured.points.len() >= doubts::ENOUGH && !is_over {
-            pool()?.install(|| self.unit_doubt(scan.middle_of_viewpoints(), &measured.points, &interrupt))?
+        let searched = &shared.searched.points;
+        let of_units = if registration.poses.is_empty() && searched.len() >= doubts::ENOUGH && !is_over {
+            pool()?.install(|| self.unit_doubt(shared.middle_of_viewpoints(), searched, &interrupt))?
         } else {
             None
         };
@@ -173,47 +213,35 @@ impl Model {
         options: &Detect,
         interrupt: &Interrupt,
     ) -> Result<MatchedScan, DetectionError> {
-        Ok(self.matched(scan, options, interrupt)?.0)
+        self.check()?;
+        let mut shared = Shared::new(scan, options, false, || Ok(self.diameter(interrupt)?))?;
+        self.matched(&mut shared, interrupt)
     }
 
-    /// And the points that were measured.
-    fn matched(
-        &self,
-        scan: &Cloud<'_>,
-        options: &Detect,
-        interrupt: &Interrupt,
-    ) -> Result<(MatchedScan, Measured), DetectionError> {
-        let normals = self.normals().ok_or(DetectionError::NoNormals)?;
-        let viewpoint = scan.middle_of_viewpoints();
-        if viewpoint.is_none() && scan.normals.is_none() {
-            return Err(DetectionError::NoSide);
-        }
-        let measured = Measured::of(&scan.points, scan.normals.as_deref())?;
-        check_points(&measured.points, Argument::Tgt)?;
-        if scan.normals.is_some() && measured.normals.is_none() {
-            let (num_missing, len) = (measured.num_without_normal, measured.points.len());
-            return Err(DetectionError::MostNormalsMissing { num_missing, len });
-        }
+    /// Whether it can be detected.
+    pub(super) fn check(&self) -> Result<&[Vector3<f64>], DetectionError> {
+        self.normals().ok_or(DetectionError::NoNormals)
+    }
+
+    fn matched(&self, shared: &mut Shared<'_>, interrupt: &Interrupt) -> Result<MatchedScan, DetectionError> {
+        let normals = self.check()?;
         let diameter = self.diameter(interrupt)?;
-        if options.check_units {
-            doubts::check_units(diameter, &measured.points)?;
+        if shared.options.check_units {
+            doubts::check_units(diameter, &shared.all)?;
         }
-        let setting =
-            Setting { voxel: self.voxel(), diameter, viewpoint, remove_plane: options.remove_plane };
-        let mut prepared = Prepared::new(&measured, &setting, interrupt)?;
-        if scan.viewpoints.len() > 1 && scan.normals.is_none() {
-            prepared.turn_to_eyes(&scan.viewpoints, &scan.measured.parts);
-        }
-        let holds_nothing =
-            prepared.points.len() < MIN_POINTS || across(&prepared.points) <= self.source().spacing;
-        let is_known = prepared.voxel <= self.voxel().max(diameter / MIN_VOXELS_PER_DIAMETER);
+        let (num_dropped, num_searched) = (shared.searched.num_dropped, shared.searched.points.len());
+        let num_points = shared.all.len();
+        let ready = shared.at(self.voxel(), interrupt)?;
+        let (voxel, num_left) = (ready.prepared.voxel, ready.prepared.points.len());
+        let holds_nothing = num_left < MIN_POINTS || across(&ready.prepared.points) <= self.source().spacing;
+        let is_known = voxel <= self.voxel().max(diameter / MIN_VOXELS_PER_DIAMETER);
 
         let matches = if holds_nothing || !is_known {
             Matches::default()
         } else {
-            let described = self.described(normals, prepared.voxel, interrupt)?;
-            let of_scan = describe(&prepared.points, &prepared.normals, prepared.voxel, interrupt)?;
-            let [model, scan] = [&described.values, &of_scan].map(|values| Descriptors { values, dim: DIM });
+            let described = self.described(normals, voxel, interrupt)?;
+            let of_scan = ready.described(interrupt)?;
+            let [model, scan] = [&described.values, of_scan].map(|values| Descriptors { values, dim: DIM });
             let matching = Matching { k: PER_POINT, ..Matching::default() };
             let mut matches = match_features(model, scan, matching, interrupt)?;
             if let Some(rows) = &described.rows {
@@ -223,13 +251,13 @@ impl Model {
         };
 
         let mut doubts = Vec::new();
-        let (num_dropped, num_points) = (measured.num_dropped, measured.points.len());
         if num_dropped > 0 {
             doubts.push(Doubt::NotFinite { num_dropped, num_given: num_dropped + num_points });
         }
-        let voxel = prepared.voxel;
         if num_points < MIN_POINTS {
             doubts.push(Doubt::FewPoints { num_points });
+        } else if num_searched < MIN_POINTS {
+            doubts.push(Doubt::FewInRoi { num_points: num_searched, num_given: num_points });
         } else if holds_nothing {
             doubts.push(Doubt::Nothing);
         } else if !is_known {
@@ -242,15 +270,10 @@ impl Model {
                 doubts.push(Doubt::Coarse { voxel, diameter });
             }
         }
-        if let Some(eye) = &viewpoint {
-            let is_behind = prepared.is_behind_table.then_some(Doubt::BehindPlane);
-            let is_one = scan.viewpoints.len() == 1;
-            doubts.extend(is_behind.or_else(|| is_one.then(|| doubts::of_viewpoint(eye, &prepared)).flatten()));
-        }
+        doubts.extend(ready.doubt.clone());
+        let (points, of_points) = (ready.prepared.points.clone(), ready.prepared.normals.clone());
         doubts.extend(self.normals_doubt(normals, interrupt)?);
-
-        let Prepared { points, normals, .. } = prepared;
-        Ok((MatchedScan { points, normals, matches, voxel, doubts }, measured))
+        Ok(MatchedScan { points, normals: of_points, matches, voxel, doubts })
     }
 
     /// Whether the normals of a cloud point inwards; those of a mesh were turned.
@@ -286,6 +309,11 @@ impl Model {
         told().or_else(|error: DetectionError| if error.is_interrupted() { Ok(None) } else { Err(error) })
     }
 
+    /// What a scan gives for which there was no time.
+    pub(super) fn no_time(&self, params: Params, start: Instant, interrupt: &Interrupt) -> Detection {
+        Detection::without_scan(self.nothing(&params, start, interrupt), params)
+    }
+
     /// What a scan gives that holds nothing to register, or for which there was no time.
     fn nothing(&self, params: &Params, start: Instant, interrupt: &Interrupt) -> Registration {
         let few = StopReason::FewCorrespondences { value: 0, threshold: MIN_POINTS as u32 };
@@ -295,15 +323,12 @@ impl Model {
 }
 
 impl MatchedScan {
-    /// What a registrar takes. `scan` is as it was given, `measured` what of it is finite.
-    fn input<'a>(&'a self, scan: &'a Cloud<'_>, measured: &'a Measured) -> (Cloud<'a>, Correspondences) {
+    /// What a registrar takes of a scan.
+    fn input<'a>(&'a self, scan: &'a Shared<'_>) -> (Cloud<'a>, Correspondences) {
         let mut target = Cloud::new(&self.points).with_normals(self.normals.clone());
         if !scan.viewpoints.is_empty() {
             target = target.with_viewpoints(scan.viewpoints.clone());
-            target.measured = match &scan.measured.parts[..] {
-                [] => Measurement { parts: vec![measured.points[..].into()], normals: measured.normals.clone() },
-                _ => scan.measured.clone(),
-            };
+            target.measured = scan.measurement();
         }
         let rows = self.matches.rows.iter().map(|pair| pair.map(|row| row as usize)).collect();
         (target, Correspondences::from_rows(rows).with_similarity(self.matches.similarity.clone()))

@@ -47,6 +47,13 @@ pub enum Doubt {
         /// How many.
         num_points: usize,
     },
+    /// Too few points for a pose lie in the box to look into.
+    FewInRoi {
+        /// How many.
+        num_points: usize,
+        /// Of how many.
+        num_given: usize,
+    },
     /// There is a table, or there are stray points, and nothing else.
     Nothing,
     /// Too little is left of the model at what the scan can carry; nothing is looked for.
@@ -106,6 +113,9 @@ impl fmt::Display for Doubt {
                 write!(f, "{num_dropped} of {num_given} points of the scan are not finite, and were left out")
             }
             Self::FewPoints { num_points } => write!(f, "the scan has {num_points} points"),
+            Self::FewInRoi { num_points, num_given } => {
+                write!(f, "roi: {num_points} of the {num_given} points of the scan lie in it")
+            }
             Self::Nothing => f.write_str("the scan is a table, or stray points, and nothing else"),
             Self::TooCoarse { voxel, diameter } => write!(
                 f,

@@ -38,6 +38,30 @@ pub enum DetectionError {
         /// Of how many.
         len: usize,
     },
+    /// A set of models without any.
+    #[error("models: there is none; give at least one")]
+    NoModels,
+    /// Two models of one name.
+    #[error("names: {name:?} is that of model {first} and of model {second}; each has one of its own")]
+    SameName {
+        /// The name.
+        name: String,
+        /// Index of a model.
+        first: usize,
+        /// Index of another one.
+        second: usize,
+    },
+    /// A box of no size.
+    #[error("roi: its side {axis} is {size} long; it must be above 0 and finite")]
+    RoiSize {
+        /// 0, 1 or 2.
+        axis: usize,
+        /// Data units.
+        size: f64,
+    },
+    /// A box that is nowhere.
+    #[error("roi: its place must be finite")]
+    RoiPlace,
     /// The scan cannot be in the unit of the model.
     #[error(
         "tgt: the scene is {} across and the model {}; are they in the same unit? (Metres for millimetres are a factor of 1000; check_units off takes them as they are.)",

@@ -7,6 +7,9 @@
 //! | `model` | [`Model`]: a source that was prepared and described once, for any number of scans |
 //! | `scan` | a scan, thinned to what it can carry, without its table |
 //! | `detect` | [`Model::correspond`] matches both, [`Model::detect`] registers as well |
+//! | `models` | [`Models`]: several kinds of parts together, whose poses are `rivals` |
+//! | `shared` | what is worked out once for all models that are looked for in a scan |
+//! | `roi` | [`Roi`]: a box to look into |
 //! | `doubts` | [`Doubt`]: what the result is to be mistrusted for |
 //!
 //! The constants were chosen on ray-cast piles, tuning half of `benchmarks/piles.py`, and on the seven scans of
@@ -18,14 +21,21 @@ mod doubts;
 mod error;
 mod extent;
 mod model;
+mod models;
+mod rivals;
+mod roi;
 mod scan;
+mod shared;
 mod sides;
+mod standpoints;
 mod surface;
 
 pub use detect::{Detect, Detection, MatchedScan};
 pub use doubts::Doubt;
 pub use error::DetectionError;
 pub use model::{Model, Origin};
+pub use models::{Detections, Models};
+pub use roi::Roi;
 pub use scan::Measured;
 pub use surface::{FromMesh, MeshSymmetries};
 

@@ -76,6 +76,13 @@ impl Measured {
         let (normals, num_without_normal) = normals.map_or((None, 0), |normals| completed(&points, normals));
         Ok(Self { points, normals, num_dropped, num_without_normal })
     }
+
+    /// The points that are wanted.
+    pub(super) fn within(self, is_wanted: impl Fn(&Point3<f64>) -> bool) -> Self {
+        let rows: Vec<usize> = (0..self.points.len()).filter(|&row| is_wanted(&self.points[row])).collect();
+        let normals = self.normals.map(|normals| picked(&normals, &rows));
+        Self { points: picked(&self.points, &rows), normals, ..self }
+    }
 }
 
 fn completed(points: &[Point3<f64>], mut normals: Vec<Vector3<f64>>) -> (Option<Vec<Vector3<f64>>>, usize) {

@@ -14,12 +14,14 @@
 //! | [`settle`] | is there a better pose close by, along those motions? |
 //! | [`noise`] | what is the unit of all that: how far do measured points lie off their surface? |
 //!
-//! [`odds`] weighs them. [`rays`] holds what one eye measured.
+//! [`odds`] weighs them. [`rays`] holds what one eye measured, and [`explained`] tells which points of it are a pose's: what poses of
+//! different models compete for.
 
 mod chance;
 mod claims;
 mod closeup;
 pub mod contour;
+pub mod explained;
 mod ledger;
 pub mod noise;
 pub mod odds;

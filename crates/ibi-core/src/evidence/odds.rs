@@ -128,4 +128,6 @@ pub enum Objection {
     Slips,
     /// Its surface lies off what was measured.
     Loose,
+    /// Better poses of other models explain too much of what it explains: see [`crate::detection::Models`].
+    Outdone,
 }

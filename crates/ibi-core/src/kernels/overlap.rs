@@ -275,7 +275,8 @@ impl<'a> Sighted<'a> {
             let eye = &view.eyes[row];
             (eye, view.own.map_or(&[][..], |own| own.from(&eye.place, target_from_source)))
         };
-        let eyes = asked(&places, &(target_from_source * middle)).into_iter().take(1).map(with_shadow).collect();
+        let eyes =
+            asked(&places, &(target_from_source * middle)).into_iter().take(1).map(with_shadow).collect();
         Self { eyes, normals, tolerance }
     }
 

@@ -67,11 +67,18 @@ pub(crate) fn asked(eyes: &[Point3<f64>], place: &Point3<f64>) -> Vec<usize> {
     let ways: Vec<Vector3<f64>> = eyes.iter().map(|eye| eye - place).collect();
     let nearest = (0..eyes.len()).min_by(|&a, &b| ways[a].norm_squared().total_cmp(&ways[b].norm_squared()));
     let directions: Vec<_> = ways.iter().map(|way| way.try_normalize(0.0).unwrap_or_default()).collect();
-    spread(nearest.unwrap_or(0), MOST_ASKED, eyes.len(), |a, b| (directions[a] - directions[b]).norm_squared())
+    spread(nearest.unwrap_or(0), MOST_ASKED, eyes.len(), |a, b| {
+        (directions[a] - directions[b]).norm_squared()
+    })
 }
 
 /// `most` of `count` things, or all: the `first`, and then, each time, the one that is farthest from all before it.
-pub(crate) fn spread(first: usize, most: usize, count: usize, far: impl Fn(usize, usize) -> f64) -> Vec<usize> {
+pub(crate) fn spread(
+    first: usize,
+    most: usize,
+    count: usize,
+    far: impl Fn(usize, usize) -> f64,
+) -> Vec<usize> {
     let mut picked = vec![first];
     let mut gap: Vec<f64> = (0..count).map(|i| far(i, first)).collect();
     while picked.len() < most.min(count) {

@@ -144,7 +144,7 @@ impl State<'_> {
                         target_from_source: hypothesis.target_from_source,
                         score: measures.score(),
                         objection: measures.objection(),
-                        measures,
+                        measures: Some(measures),
                         round: candidate.round,
                     });
                     let passed = candidate.hypothesis.target_from_source;

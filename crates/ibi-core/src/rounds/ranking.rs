@@ -10,12 +10,9 @@ use super::state::State;
 use crate::evidence::Support;
 use crate::grace::Grace;
 use crate::interrupt::Phase;
-use crate::registration::{Pose, Registration};
+use crate::registration::{MAX_REJECTED, Pose, Registration};
 use crate::scene::Scene;
 use crate::stop::StopReason;
-
-/// Rejected poses that are told of.
-const MAX_REJECTED: usize = 100;
 
 impl State<'_> {
     /// The result: `supports` tells what speaks for each instance. Those for which there is no time are left out.

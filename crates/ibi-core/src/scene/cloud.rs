@@ -59,12 +59,6 @@ impl<'a> Cloud<'a> {
         self
     }
 
-    /// Where the cameras stood on average.
-    pub(crate) fn middle_of_viewpoints(&self) -> Option<Point3<f64>> {
-        let sum: Vector3<f64> = self.viewpoints.iter().map(|eye| eye.coords).sum();
-        (!self.viewpoints.is_empty()).then(|| Point3::from(sum / self.viewpoints.len() as f64))
-    }
-
     /// Where the depth camera stood, in the frame of the points; for scenes seen from one side.
     #[must_use]
     pub fn with_viewpoint(mut self, viewpoint: Point3<f64>) -> Self {

@@ -4,10 +4,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use ibi_core::detection::{
-    Detect, Detection, DetectionError, Doubt, FromMesh, Measured, MeshSymmetries, Model, Origin, Run,
+    Detect, Detection, DetectionError, Doubt, FromMesh, Measured, MeshSymmetries, Model, Models, Origin, Roi,
+    Run,
 };
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
-use ibi_core::{CancelToken, Cloud, Error, Interrupt, Params, Phase, StopReason};
+use ibi_core::{CancelToken, Cloud, Error, Interrupt, Objection, Params, Phase, Round, StopReason};
 use ibi_testkit::Rng;
 use ibi_testkit::shapes::{self, Solid};
 
@@ -330,4 +331,136 @@ fn time_counts_from_the_call() {
         assert!(threshold == timeout_s && value >= timeout_s, "{phase:?}: {value}");
         assert_eq!(found.params.timeout_s, Some(timeout_s));
     }
+}
+
+fn named(parts: &[(&str, &Arc<Model>)]) -> Models {
+    Models::new(parts.iter().map(|&(name, model)| (name.to_owned(), Arc::clone(model))).collect()).unwrap()
+}
+
+/// A lopsided box twice and a tee once, far apart, as a camera sees them; and where they are.
+fn mixed() -> ([Arc<Model>; 2], [Vec<Isometry3<f64>>; 2], Vec<Point3<f64>>, Point3<f64>) {
+    let parts = [shapes::lopsided(), shapes::tee()].map(|solid| Arc::new(model(&solid)));
+    let places = placed(3, 5.0, 3);
+    let truth = [places[..2].to_vec(), places[2..].to_vec()];
+    let eye = Point3::new(4.0, 2.0, 40.0);
+    let points = (0..2).flat_map(|i| seen(scene(&parts[i], &truth[i]), &eye).0).collect();
+    (parts, truth, points, eye)
+}
+
+#[test]
+fn several_models_are_found_together() {
+    let (parts, truth, points, eye) = mixed();
+    // The box alone fits into nothing of its own: it is a part of the lopsided one.
+    let plain = Arc::new(model(&shapes::cuboid([3.0, 2.0, 1.0])));
+    let models = named(&[("plain", &plain), ("lopsided", &parts[0]), ("tee", &parts[1])]);
+    assert_eq!(models.names().collect::<Vec<_>>(), ["plain", "lopsided", "tee"]);
+    let scan = Cloud::new(&points).with_viewpoint(eye);
+    let alone = plain.detect(&scan, &Detect::default()).unwrap();
+    assert!(!alone.registration.poses.is_empty());
+    let mut before = None;
+    for num_threads in [1, 2] {
+        let options =
+            Detect { run: Run { num_threads: Some(num_threads), ..Run::default() }, ..Detect::default() };
+        let found = models.detect(&scan, &options).unwrap();
+        for (part, (model, truth)) in found.parts[1..].iter().zip(parts.iter().zip(&truth)) {
+            assert_eq!(num_right(part, model, truth), truth.len());
+        }
+        let plain = &found.parts[0].registration;
+        let outdone = plain.rejected.iter().filter(|rejected| rejected.objection == Objection::Outdone);
+        assert_eq!(outdone.count() + plain.poses.len(), alone.registration.poses.len());
+        assert!(plain.poses.is_empty() && plain.labels.iter().all(Option::is_none));
+        let scores: Vec<f64> = found
+            .ranking
+            .iter()
+            .map(|&[part, pose]| found.parts[part].registration.poses[pose].score)
+            .collect();
+        assert!(scores.is_sorted_by(|a, b| a >= b));
+        assert_eq!(found.ranking.len(), found.parts.iter().map(|part| part.registration.poses.len()).sum());
+        let poses: Vec<_> = found
+            .parts
+            .iter()
+            .flat_map(|part| part.registration.poses.iter().map(|pose| (pose.target_from_source, pose.score)))
+            .collect();
+        assert_eq!(*before.get_or_insert(poses.clone()), poses);
+    }
+}
+
+#[test]
+fn a_set_of_one_model_finds_what_the_model_finds() {
+    let (parts, _, points, eye) = mixed();
+    let scan = Cloud::new(&points).with_viewpoint(eye);
+    let alone = parts[0].detect(&scan, &Detect::default()).unwrap();
+    let found = named(&[("one", &parts[0])]).detect(&scan, &Detect::default()).unwrap();
+    let poses = |of: &Detection| -> Vec<_> {
+        of.registration
+            .poses
+            .iter()
+            .map(|pose| (pose.target_from_source, pose.score, pose.inliers.clone()))
+            .collect()
+    };
+    assert_eq!(poses(&found.parts[0]), poses(&alone));
+    assert_eq!(found.parts[0].registration.labels, alone.registration.labels);
+    assert_eq!(found.stop_reason, alone.registration.stop_reason);
+}
+
+#[test]
+fn a_set_of_models_ends_as_one_does() {
+    let (parts, _, points, eye) = mixed();
+    let models = named(&[("lopsided", &parts[0]), ("tee", &parts[1])]);
+    let scan = Cloud::new(&points).with_viewpoint(eye);
+    let params = Params { timeout_s: Some(0.0), ..Params::single_view() };
+    let found = models.detect(&scan, &Detect { params: Some(params), ..Detect::default() }).unwrap();
+    assert!(matches!(found.stop_reason, StopReason::Timeout { threshold: 0.0, .. }));
+    assert!(found.ranking.is_empty() && found.parts.len() == 2);
+    let mut num_rounds = 0;
+    let mut once = |_: &Round| {
+        num_rounds += 1;
+        std::ops::ControlFlow::Break(())
+    };
+    let set_up = |_, registrar, _: &ibi_core::detection::MatchedScan| registrar;
+    let found = models.detect_with(&scan, &Detect::default(), set_up, &mut once).unwrap();
+    assert_eq!((num_rounds, found.stop_reason), (1, StopReason::Cancelled));
+    let cancel = CancelToken::default();
+    cancel.cancel();
+    let run = Run { cancel, ..Run::default() };
+    let found = models.detect(&scan, &Detect { run, ..Detect::default() }).unwrap();
+    assert_eq!(found.stop_reason, StopReason::Cancelled);
+
+    assert_eq!(Models::new(Vec::new()).unwrap_err(), DetectionError::NoModels);
+    let twice = vec![("a".to_owned(), parts[0].clone()), ("a".to_owned(), parts[1].clone())];
+    assert!(matches!(Models::new(twice).unwrap_err(), DetectionError::SameName { first: 0, second: 1, .. }));
+    let bare = Arc::new(Model::from_cloud(&Cloud::from(parts[0].points().to_vec())).unwrap());
+    let mixed = named(&[("a", &parts[0]), ("b", &bare)]);
+    assert_eq!(mixed.detect(&scan, &Detect::default()).unwrap_err(), DetectionError::NoNormals);
+}
+
+#[test]
+fn only_a_region_is_looked_into() {
+    let (parts, truth, points, eye) = mixed();
+    let scan = || Cloud::new(&points).with_viewpoint(eye);
+    let middle = truth[0][1] * Point3::origin();
+    let reach = Vector3::repeat(2.2);
+    let roi = Some(Roi::between(middle - reach, middle + reach));
+    let found = parts[0].detect(&scan(), &Detect { roi, ..Detect::default() }).unwrap();
+    assert_eq!(num_right(&found, &parts[0], &truth[0][1..]), 1);
+    assert_eq!(found.registration.poses.len(), 1);
+    // As if the rest had been cut off, and were still known to have been measured.
+    let inside: Vec<_> = points.iter().copied().filter(|p| roi.unwrap().contains(p)).collect();
+    let cut = Cloud::new(&inside).with_viewpoint(eye).with_measured(&points[..]);
+    let cut = parts[0].detect(&cut, &Detect::default()).unwrap();
+    assert_eq!(found.registration.poses[0].measures, cut.registration.poses[0].measures);
+    assert_eq!(found.scan.unwrap().points, cut.scan.unwrap().points);
+
+    let far = Some(Roi::between(middle + 50.0 * reach, middle + 51.0 * reach));
+    let nothing = parts[0].detect(&scan(), &Detect { roi: far, ..Detect::default() }).unwrap();
+    let doubts: Vec<_> = nothing.doubts().cloned().collect();
+    assert_eq!(doubts, [Doubt::FewInRoi { num_points: 0, num_given: points.len() }]);
+    for (size, axis) in [([1.0, 0.0, 1.0], 1), ([1.0, 1.0, f64::NAN], 2), ([-1.0, 1.0, 1.0], 0)] {
+        let roi = Some(Roi { target_from_box: Isometry3::identity(), size: Vector3::from(size) });
+        let error = parts[0].detect(&scan(), &Detect { roi, ..Detect::default() }).unwrap_err();
+        assert!(error.to_string().starts_with(&format!("roi: its side {axis} is ")));
+    }
+    let roi = Some(Roi { target_from_box: Isometry3::translation(0.0, f64::NAN, 0.0), size: reach });
+    let error = parts[0].detect(&scan(), &Detect { roi, ..Detect::default() }).unwrap_err();
+    assert_eq!(error, DetectionError::RoiPlace);
 }

@@ -3,6 +3,7 @@
 use std::f64::consts::{PI, TAU};
 
 use ibi_core::evidence::contour::{Contour, Overrun, Placed, Rim, Scan, contour, overrun, run_on};
+use ibi_core::evidence::explained::{Reach, Shape, explained};
 use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays};
 use ibi_core::evidence::odds::Measures;
 use ibi_core::evidence::rays::{MAX_ANGLE, MIN_FACING_COS, Rays, visible};
@@ -766,4 +767,29 @@ fn too_few_points_have_no_noise() {
 /// A number of its own for each ray.
 fn rng_at(seed: u64, x: f64, y: f64) -> f64 {
     Rng::new(seed ^ x.to_bits().rotate_left(17) ^ y.to_bits()).normal()
+}
+
+#[test]
+fn what_a_pose_explains_is_what_its_definition_says() {
+    let (points, normals) = cuboid([3.0, 2.0, 0.2], 0.4);
+    let shape = Shape { points: &points, normals: &normals };
+    let reach = Reach { across: 0.3, aside: 0.5 };
+    for seed in 0..20 {
+        let mut rng = Rng::new(seed);
+        let pose = rng.pose_at(Vector3::new(1.0, -2.0, 30.0));
+        let scan: Vec<_> = (0..2000)
+            .map(|_| pose * Point3::from([4.0, 3.0, 1.0].map(|half| half * (2.0 * rng.uniform() - 1.0))))
+            .collect();
+        for eyes in [vec![], vec![Point3::origin()], vec![Point3::origin(), Point3::new(0.0, 0.0, 60.0)]] {
+            let found = explained(shape, &pose, &eyes, &scan, reach);
+            let own = [reach.across, reach.aside];
+            let oracle = naive::explained((&points, &normals), &pose, &eyes, MIN_FACING_COS, &scan, own);
+            assert_eq!(found, oracle);
+            assert!(found.len() > 20 && found.len() < 1500);
+        }
+    }
+    assert_eq!(
+        explained(Shape { points: &[], normals: &[] }, &Isometry3::identity(), &[], &points, reach),
+        []
+    );
 }
