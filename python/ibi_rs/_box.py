@@ -74,7 +74,9 @@ class Box:
         corners = _floats("low", low, 3), _floats("high", high, 3)
         if not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             shown = " and ".join(str(corner.tolist()) for corner in corners)
-            raise _core.InputError(f"roi: its corners are {shown}; they must be finite, the first below the second")
+            raise _core.InputError(
+                f"roi: its corners are {shown}; they must be finite, the first below the second"
+            )
         return cls((corners[0] + corners[1]) / 2, corners[1] - corners[0])
 
     @property

@@ -134,7 +134,9 @@ class Job:
             "callback": callback,
         }
         if self.corr is None:
-            return self.model.detect(tgt, self.params, remove_plane=self.remove_plane, roi=self.roi, **options)
+            return self.model.detect(
+                tgt, self.params, remove_plane=self.remove_plane, roi=self.roi, **options
+            )
         options |= {"tgt_frames": self.tgt_frames, "similarity": self.similarity}
         return self.model.register(tgt, self.corr, self.params, **options)
 

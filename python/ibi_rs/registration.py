@@ -454,7 +454,10 @@ class Registration(Sequence[Pose]):
             new = np.array([*(place[model, pose] for pose in range(len(part))), -1], dtype=np.int32)
             labels.append(new[part.labels])
         rejected = sorted((one for part in parts for one in part.rejected), key=lambda one: -one.score)
-        seconds = {name: sum(getattr(part.timings, name) for part in parts) for name in (field.name for field in fields(Timings))}
+        seconds = {
+            name: sum(getattr(part.timings, name) for part in parts)
+            for name in (field.name for field in fields(Timings))
+        }
         texts = dict.fromkeys(text for part in parts for text in part.warnings)
         about = {
             text: [name for name, part in zip(names, parts, strict=True) if text in part.warnings]
@@ -480,7 +483,9 @@ class Registration(Sequence[Pose]):
     def _of(cls, raw: dict[str, Any], params: Params) -> Registration:
         """Dress what the core gives."""
         measures = [of and Measures._of(of) for of in json.loads(raw["measures"])]
-        columns = [raw[field.name] for field in fields(Pose) if field.name in raw and field.name != "measures"]
+        columns = [
+            raw[field.name] for field in fields(Pose) if field.name in raw and field.name != "measures"
+        ]
         rejected = zip(raw["rejected_poses"], json.loads(raw["rejected"]), strict=True)
         return cls(
             list(map(Pose, *columns, measures)),

@@ -30,7 +30,9 @@ ModelFile = Annotated[
 ]
 ModelFiles = Annotated[
     list[Path],
-    typer.Argument(help="Mesh of the part, or of each of several: STL, PLY, OBJ, OFF or GLB.", metavar="MODEL"),
+    typer.Argument(
+        help="Mesh of the part, or of each of several: STL, PLY, OBJ, OFF or GLB.", metavar="MODEL"
+    ),
 ]
 SceneFile = Annotated[
     Path, typer.Argument(help="Scan: PLY, PCD, LAS, XYZ, CSV, NPY ... in the same unit.", metavar="SCENE")
@@ -96,7 +98,9 @@ class Search:
             misused("--from-all-sides has no --viewpoint; leave one of them out")
         if self.viewpoint is not None and not np.isfinite(self.viewpoint).all():
             misused("--viewpoint must be three finite numbers")
-        if self.crop is not None and not (np.isfinite(self.crop).all() and np.less(self.crop[:3], self.crop[3:]).all()):
+        if self.crop is not None and not (
+            np.isfinite(self.crop).all() and np.less(self.crop[:3], self.crop[3:]).all()
+        ):
             misused("--crop must be six finite numbers, the first three each below one of the last three")
         if self.voxel is not None and not 0 < self.voxel < np.inf:
             misused(f"--voxel is {self.voxel:g}; it must be above 0 and finite")

@@ -136,10 +136,12 @@ impl Model {
         self.check()?;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
-        let shared = pool.install(|| Shared::new(scan, options, || Ok(self.diameter(&interrupt)?)));
+        let shared = pool.install(|| {
+            Shared::new(scan, options.roi.as_ref(), options.remove_plane, || Ok(self.diameter(&interrupt)?))
+        });
         drop(pool);
         match shared {
-            Ok(mut shared) => self.search(&mut shared, params, start, set_up, observer),
+            Ok(mut shared) => self.search(&mut shared, options, params, start, set_up, observer),
             Err(error) if error.is_interrupted() => Ok(self.no_time(params, start, &interrupt)),
             Err(error) => Err(error),
         }
@@ -149,16 +151,16 @@ impl Model {
     pub(super) fn search(
         &self,
         shared: &mut Shared<'_>,
+        options: &Detect,
         mut params: Params,
         start: Instant,
         set_up: impl FnOnce(Registrar<'static>, &MatchedScan) -> Registrar<'static>,
         observer: &mut dyn Observer,
     ) -> Result<Detection, DetectionError> {
-        let options = shared.options;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         // The registrar has a pool of its own, which takes the threads of this one over.
         let pool = || Pool::new(options.run.num_threads);
-        let matched = pool()?.install(|| self.matched(shared, &interrupt));
+        let matched = pool()?.install(|| self.matched(shared, options.check_units, &interrupt));
         let matched = match matched {
             Ok(matched) => matched,
             Err(error) if error.is_interrupted() => return Ok(self.no_time(params, start, &interrupt)),
@@ -209,8 +211,9 @@ impl Model {
         interrupt: &Interrupt,
     ) -> Result<MatchedScan, DetectionError> {
         self.check()?;
-        let mut shared = Shared::new(scan, options, || Ok(self.diameter(interrupt)?))?;
-        self.matched(&mut shared, interrupt)
+        let mut shared =
+            Shared::new(scan, options.roi.as_ref(), options.remove_plane, || Ok(self.diameter(interrupt)?))?;
+        self.matched(&mut shared, options.check_units, interrupt)
     }
 
     /// Whether it can be detected.
@@ -218,10 +221,15 @@ impl Model {
         self.normals().ok_or(DetectionError::NoNormals)
     }
 
-    fn matched(&self, shared: &mut Shared<'_>, interrupt: &Interrupt) -> Result<MatchedScan, DetectionError> {
+    fn matched(
+        &self,
+        shared: &mut Shared<'_>,
+        check_units: bool,
+        interrupt: &Interrupt,
+    ) -> Result<MatchedScan, DetectionError> {
         let normals = self.check()?;
         let diameter = self.diameter(interrupt)?;
-        if shared.options.check_units {
+        if check_units {
             doubts::check_units(diameter, &shared.all)?;
         }
         let (num_dropped, num_searched) = (shared.searched.num_dropped, shared.searched.points.len());

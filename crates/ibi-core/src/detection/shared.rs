@@ -5,9 +5,11 @@ use std::collections::btree_map::Entry;
 
 use nalgebra::Point3;
 
+use super::doubts::{self, Doubt};
+use super::error::DetectionError;
 use super::model::describe;
+use super::roi::Roi;
 use super::scan::{Measured, Prepared, Setting};
-use super::{Detect, DetectionError, Doubt, doubts};
 use crate::error::Argument;
 use crate::interrupt::Interrupt;
 use crate::scene::{Cloud, check_points};
@@ -15,7 +17,7 @@ use crate::scene::{Cloud, check_points};
 /// A scan that was checked, and what was made of it at each voxel that a model has asked for.
 pub(super) struct Shared<'a> {
     pub(super) scan: &'a Cloud<'a>,
-    pub(super) options: &'a Detect,
+    remove_plane: Option<bool>,
     /// What of the scan is finite.
     pub(super) all: Vec<Point3<f64>>,
     /// What of that is searched: all, or what lies in the region of interest.
@@ -35,16 +37,17 @@ pub(super) struct Ready {
 }
 
 impl<'a> Shared<'a> {
-    /// Checks a scan. `diameter`: of the largest model.
+    /// Checks a scan, of which what lies in `roi` is searched. `diameter`: of the largest model.
     pub(super) fn new(
         scan: &'a Cloud<'a>,
-        options: &'a Detect,
+        roi: Option<&Roi>,
+        remove_plane: Option<bool>,
         diameter: impl FnOnce() -> Result<f64, DetectionError>,
     ) -> Result<Self, DetectionError> {
         if scan.viewpoint.is_none() && scan.normals.is_none() {
             return Err(DetectionError::NoSide);
         }
-        if let Some(roi) = &options.roi {
+        if let Some(roi) = roi {
             roi.check()?;
         }
         let measured = Measured::of(&scan.points, scan.normals.as_deref())?;
@@ -55,11 +58,11 @@ impl<'a> Shared<'a> {
         }
         let diameter = diameter()?;
         let all = measured.points.clone();
-        let searched = match &options.roi {
+        let searched = match roi {
             Some(roi) => measured.within(|point| roi.contains(point)),
             None => measured,
         };
-        Ok(Self { scan, options, all, searched, diameter, ready: BTreeMap::new() })
+        Ok(Self { scan, remove_plane, all, searched, diameter, ready: BTreeMap::new() })
     }
 
     /// What it is at the voxel of a model.
@@ -68,12 +71,8 @@ impl<'a> Shared<'a> {
         match self.ready.entry(voxel.to_bits()) {
             Entry::Occupied(ready) => Ok(ready.into_mut()),
             Entry::Vacant(place) => {
-                let setting = Setting {
-                    voxel,
-                    diameter: self.diameter,
-                    viewpoint,
-                    remove_plane: self.options.remove_plane,
-                };
+                let setting =
+                    Setting { voxel, diameter: self.diameter, viewpoint, remove_plane: self.remove_plane };
                 let prepared = Prepared::new(&self.searched, &setting, interrupt)?;
                 let doubt = viewpoint.and_then(|eye| {
                     let is_behind = prepared.is_behind_table.then_some(Doubt::BehindPlane);
