@@ -5,11 +5,12 @@
     python benchmarks/bins.py --half tuning          # where anything is chosen
     IBI_DATA=SCANS python benchmarks/bins.py         # the real boxes as well
 
-In each scan all parts of its kind are looked for: alone, by `Model.detect` one after the other, and together, by `Models.detect`.
-Bins are those of `ibi.synth.bin_scene`: `mixed` ones hold parts of all five kinds, the others one kind only, so that the other
-four are not there. Of the boxes of which there is a model each both are looked for. A pose is right by ADD-S below a tenth of the
-diameter, one to one; asked for are instances of which half of the silhouette is seen. Poses that are right for one of which less is
-seen count in precision alone.
+In each scan all parts of its kind are looked for: alone, by `Model.detect` one after the other, and
+together, by `Models.detect`. Bins are those of `ibi.synth.bin_scene`: `mixed` ones hold parts of all five
+kinds, the others one kind only, so that the other four are not there. In each real frame both kinds of
+boxes are looked for. A pose is right by ADD-S below a tenth of the diameter, one to one; asked for are
+instances of which half of the silhouette is seen. Poses that are right for one of which less is seen count
+in precision alone.
 """
 
 from __future__ import annotations

@@ -18,16 +18,52 @@ CORNERS = np.array([[x, y, z] for x in (-20, 20) for y in (-13, 13) for z in (-3
 PLATE = (
     CORNERS,
     np.array(
-        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
-        + [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
-    ),
+        [
+            0,
+            1,
+            3,
+            0,
+            3,
+            2,
+            4,
+            6,
+            7,
+            4,
+            7,
+            5,
+            0,
+            4,
+            5,
+            0,
+            5,
+            1,
+            2,
+            3,
+            7,
+            2,
+            7,
+            6,
+            0,
+            2,
+            6,
+            0,
+            6,
+            4,
+            1,
+            5,
+            7,
+            1,
+            7,
+            3,
+        ]
+    ).reshape(-1, 3),
 )
 DISTANCE, FOCAL, SHAPE = 500.0, 700.0, (300, 400)
 EYE = [0, 0, 0]
 
 
 def scan_of(*parts, seed=0, noise=0.1):
-    """(N, 3) of meshes in world poses on a table, z = 0, as a camera sees them from above, and their poses."""
+    """(N, 3) of meshes in world poses on a table, z = 0, as a camera sees them, and their poses."""
     rng = np.random.default_rng(seed)
     camera = np.diag([1.0, -1, -1, 1])
     camera[:3, :3] = Rotation.from_euler("x", 25, degrees=True).as_matrix() @ camera[:3, :3]
@@ -49,7 +85,7 @@ def scan_of(*parts, seed=0, noise=0.1):
 
 
 def lying(mesh, place, *turns):
-    """A pose in which the mesh lies on the table, its middle at x, y of the table; turns are "x", 90 and so on."""
+    """A pose in which the mesh lies on the table, its middle at a place; turns are "x", 90 and so on."""
     pose = np.eye(4)
     for axis, angle in zip(turns[::2], turns[1::2], strict=True):
         pose[:3, :3] = Rotation.from_euler(axis, angle, degrees=True).as_matrix() @ pose[:3, :3]
@@ -128,7 +164,8 @@ def test_one_part_is_found_as_by_its_model(models, scene):
     ):
         same(one, alone)
         same(one.of(0), alone)
-    assert alone.of(0) is alone and alone.models == ()
+    assert alone.of(0) is alone
+    assert alone.models == ()
     assert {(pose.model, pose.model_name) for pose in alone} == {(0, None)}
 
 
@@ -161,7 +198,7 @@ def test_a_plate_on_the_face_of_a_bracket_is_outdone_and_so_is_its_mirror_image(
 
 
 def test_of_the_same_part_given_twice_each_instance_is_found_once(models, scene):
-    points, truths = scene
+    points, _ = scene
     twice = ibi.Models([models["bolt"], models["bolt"]])
     found = twice.detect(points, viewpoint=ibi.View(EYE, points))
     alone = models["bolt"].detect(points, viewpoint=ibi.View(EYE, points))
@@ -193,7 +230,8 @@ def test_the_result_is_one_of_all_and_of_each(found, models, scene):
     starts = np.cumsum([0, *lengths])
     for k, pose in enumerate(found):
         mine = np.flatnonzero(found.labels == k)
-        assert len(mine) and np.isin(mine, pose.inliers).all()
+        assert len(mine)
+        assert np.isin(mine, pose.inliers).all()
         assert ((starts[pose.model] <= pose.inliers) & (pose.inliers < starts[pose.model + 1])).all()
     with pytest.raises(KeyError, match="model 'nut'; there are 'bolt', 'pin'"):
         found.of("nut")
@@ -206,7 +244,9 @@ def test_the_result_is_one_of_all_and_of_each(found, models, scene):
 
 
 def test_a_set_is_a_sequence_of_its_models(models):
-    assert len(models) == 2 and models[1] is models["pin"] and list(models) == [models[0], models[1]]
+    assert len(models) == 2
+    assert models[1] is models["pin"]
+    assert list(models) == [models[0], models[1]]
     assert repr(models).startswith("Models: 2\n  bolt: Model(")
     assert ibi.Models([models[0], PIN]).names == ("0", "1")
     with pytest.raises(KeyError):
@@ -216,11 +256,15 @@ def test_a_set_is_a_sequence_of_its_models(models):
 def test_time_counts_once_and_a_callback_ends_all(models, scene):
     points, _ = scene
     found = models.detect(points, viewpoint=EYE, timeout_s=0)
-    assert len(found) == 0 and found.stop_reason.name == "timeout" and found.stop_reason.threshold == 0
+    assert len(found) == 0
+    assert found.stop_reason.name == "timeout"
+    assert found.stop_reason.threshold == 0
     rounds = []
     ended = models.detect(points, viewpoint=EYE, callback=lambda done: bool(rounds.append(done)))
-    assert len(rounds) == 1 and ended.stop_reason.name == "cancelled"
-    assert ended.of("pin").stop_reason.name == "cancelled" and len(ended.of("pin").rounds) == 0
+    assert len(rounds) == 1
+    assert ended.stop_reason.name == "cancelled"
+    assert ended.of("pin").stop_reason.name == "cancelled"
+    assert len(ended.of("pin").rounds) == 0
 
 
 def test_a_warning_names_the_parts_it_is_about(models):
@@ -283,7 +327,8 @@ def test_only_what_lies_in_the_box_is_matched_and_all_is_measured(models, scene)
     middle = np.mean(move(truths["bolt"][1], BOLT[0]), axis=0)
     low, high = middle - 40, middle + 40
     found = model.detect(points, viewpoint=view, roi=[low, high])
-    assert len(found) == 1 and is_right(found[0], truths["bolt"][1], model)
+    assert len(found) == 1
+    assert is_right(found[0], truths["bolt"][1], model)
     inside = points[((low <= points) & (points <= high)).all(axis=1)]
     same(found, model.detect(inside, viewpoint=view))
     # The rays beside the box are told of by the view alone.
@@ -306,7 +351,8 @@ def test_a_box_may_be_turned(models, scene):
     np.testing.assert_array_equal(first.tgt, second.tgt)
     turned = model.correspond(points, viewpoint=EYE, roi=ibi.Box(middle, [150, 80, 200], turn))
     assert len(turned.tgt) != len(first.tgt)
-    assert repr(boxes[0]).endswith("size=[150, 80, 200])") and repr(boxes[1]).endswith("turned)")
+    assert repr(boxes[0]).endswith("size=[150, 80, 200])")
+    assert repr(boxes[1]).endswith("turned)")
 
 
 def test_an_empty_box_is_told(models, scene):
@@ -343,7 +389,8 @@ def test_the_command_finds_several_parts(files, scene):
     held = json.loads(outputs[0].read_text())
     assert [held["model"], len(held["model_sha256"])] == [[str(part) for part in parts], 2]
     counts = Counter((pose["model"], pose["model_name"]) for pose in held["poses"])
-    assert set(counts) <= {(0, "bolt"), (1, "pin")} and counts[0, "bolt"] == 2
+    assert set(counts) <= {(0, "bolt"), (1, "pin")}
+    assert counts[0, "bolt"] == 2
     assert f"({counts[0, 'bolt']} bolt, {counts[1, 'pin']} pin)" in result.stdout
     ids = Counter(line.split(",")[2] for line in outputs[1].read_text().splitlines()[1:])
     assert ids == {str(model + 1): count for (model, _), count in counts.items()}
@@ -356,7 +403,8 @@ def test_the_command_looks_into_a_box(files, scene):
     result = run("register", files / "bolt.obj", files / "scan.npy", "--crop", crop, "-o", output)
     assert result.exit_code == 0, result.output
     held = json.loads(output.read_text())
-    assert len(held["poses"]) == 1 and "model" not in held["poses"][0]
+    assert len(held["poses"]) == 1
+    assert "model" not in held["poses"][0]
     assert len(held["search"]["crop"]) == 6
 
 

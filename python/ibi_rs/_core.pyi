@@ -170,7 +170,7 @@ def detect_together(
     on_round: Callable[[str], object] | None,
     own: Sequence[Callable[[_Floats, _Ints], dict[str, Callable[..., object]]]],
 ) -> tuple[list[dict[str, Any]], list[list[int]], str, str, float]:
-    """Of each model as `detect`; [model, its pose] of all poses, best first; why it ended, as JSON and in words; seconds."""
+    """Of each as `detect`; [model, its pose], best first; why it ended, as JSON and words; seconds."""
 
 # Symmetries.
 

@@ -62,8 +62,9 @@ def show(found: ibi.Registration, seconds: float) -> None:
         print_table(table)
         out.print("x, y, z in the unit of the scene; rx, ry, rz: rotation vector, degrees", style="dim")
     counts = ", ".join(f"{len(found.of(name))} {name}" for name in found.models)
+    what = f"{len(found)} found ({counts})" if is_of_several else f"{len(found)} found"
     out.print(
-        f"{len(found)} found{f' ({counts})' if is_of_several else ''} in {seconds:.2f} s; stopped by {found.stop_reason}",
+        f"{what} in {seconds:.2f} s; stopped by {found.stop_reason}",
         highlight=False,
         markup=False,
     )
@@ -119,7 +120,7 @@ def as_dict(
         "search": search,
         "poses": [
             {
-                **({"model": pose.model, "model_name": pose.model_name} if len(found.models) > 1 else {}),
+                **(_part(pose) if len(found.models) > 1 else {}),
                 "target_from_source": pose.target_from_source.tolist(),
                 "score": pose.score,
                 "overlap": pose.overlap,
@@ -136,6 +137,10 @@ def as_dict(
     }
 
 
+def _part(pose: ibi.Pose) -> dict[str, Any]:
+    return {"model": pose.model, "model_name": pose.model_name}
+
+
 def write_json(path: Path, data: dict[str, Any]) -> None:
     """All of it or nothing, so that what is there after Ctrl-C can be relied on."""
     with written(path) as part:
@@ -143,7 +148,7 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
 
 
 def write_bop(path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], *obj_ids: int) -> None:
-    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds; an obj_id for all or for each."""
+    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds; an obj_id each."""
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["scene_id", "im_id", "obj_id", "score", "R", "t", "time"])

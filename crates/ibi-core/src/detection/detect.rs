@@ -20,9 +20,6 @@ use crate::registration::Registration;
 use crate::scene::{Cloud, Correspondences};
 use crate::stop::StopReason;
 
-/// A scan of more cameras is one that was walked around.
-const FEW_VIEWPOINTS: usize = 4;
-
 /// Nearest model points that each scene point is joined to: walls and edges repeat on a part.
 const PER_POINT: usize = 4;
 
@@ -36,8 +33,7 @@ const MIN_POINTS: usize = 3;
 /// How a model is looked for in a scan.
 #[derive(Debug, Clone)]
 pub struct Detect {
-    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with one to four viewpoints, else
-    /// [`Params::many_views`].
+    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with a viewpoint, else the default.
     pub params: Option<Params>,
     /// Whether the plane with most points is taken away. `None`: where it looks like a table, with less than 2 % of the
     /// points behind it as the viewpoint sees it.
@@ -60,9 +56,10 @@ impl Default for Detect {
 impl Detect {
     /// Those that were given, or those that fit the scan; checked.
     pub(super) fn params_for(&self, scan: &Cloud<'_>) -> Result<Params, DetectionError> {
-        let is_few = (1..=FEW_VIEWPOINTS).contains(&scan.viewpoints.len());
-        let preset = || if is_few { Params::single_view() } else { Params::many_views() };
-        let params = self.params.clone().unwrap_or_else(preset);
+        let params = self.params.clone().unwrap_or_else(|| match scan.viewpoint {
+            Some(_) => Params::single_view(),
+            None => Params::default(),
+        });
         params.validate()?;
         Ok(params)
     }
@@ -140,11 +137,11 @@ impl Model {
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
         let shared = pool.install(|| {
-            Shared::new(scan, options, params.oriented_normals, || Ok(self.diameter(&interrupt)?))
+            Shared::new(scan, options.roi.as_ref(), options.remove_plane, || Ok(self.diameter(&interrupt)?))
         });
         drop(pool);
         match shared {
-            Ok(mut shared) => self.search(&mut shared, params, start, set_up, observer),
+            Ok(mut shared) => self.search(&mut shared, options, params, start, set_up, observer),
             Err(error) if error.is_interrupted() => Ok(self.no_time(params, start, &interrupt)),
             Err(error) => Err(error),
         }
@@ -154,16 +151,16 @@ impl Model {
     pub(super) fn search(
         &self,
         shared: &mut Shared<'_>,
+        options: &Detect,
         mut params: Params,
         start: Instant,
         set_up: impl FnOnce(Registrar<'static>, &MatchedScan) -> Registrar<'static>,
         observer: &mut dyn Observer,
     ) -> Result<Detection, DetectionError> {
-        let options = shared.options;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         // The registrar has a pool of its own, which takes the threads of this one over.
         let pool = || Pool::new(options.run.num_threads);
-        let matched = pool()?.install(|| self.matched(shared, &interrupt));
+        let matched = pool()?.install(|| self.matched(shared, options.check_units, &interrupt));
         let matched = match matched {
             Ok(matched) => matched,
             Err(error) if error.is_interrupted() => return Ok(self.no_time(params, start, &interrupt)),
@@ -179,7 +176,7 @@ impl Model {
             let timeout_s = params.timeout_s.map(|limit| (limit - spent_s).max(0.0));
             let limited = Params { timeout_s, ..params.clone() };
             let registrar = options.run.registrar(Registrar::of(self.source().clone()).params(limited));
-            let (target, correspondences) = matched.input(shared);
+            let (target, correspondences) = matched.input(shared.scan, &shared.all);
             let registrar = set_up(registrar, &matched);
             let mut found = registrar.register_observed(&target, &correspondences, observer)?;
             if let StopReason::Timeout { value, threshold } = &mut found.stop_reason {
@@ -191,7 +188,7 @@ impl Model {
         let is_over = registration.stop_reason.is_from_outside();
         let searched = &shared.searched.points;
         let of_units = if registration.poses.is_empty() && searched.len() >= doubts::ENOUGH && !is_over {
-            pool()?.install(|| self.unit_doubt(shared.middle_of_viewpoints(), searched, &interrupt))?
+            pool()?.install(|| self.unit_doubt(shared.scan.viewpoint, searched, &interrupt))?
         } else {
             None
         };
@@ -214,8 +211,9 @@ impl Model {
         interrupt: &Interrupt,
     ) -> Result<MatchedScan, DetectionError> {
         self.check()?;
-        let mut shared = Shared::new(scan, options, false, || Ok(self.diameter(interrupt)?))?;
-        self.matched(&mut shared, interrupt)
+        let mut shared =
+            Shared::new(scan, options.roi.as_ref(), options.remove_plane, || Ok(self.diameter(interrupt)?))?;
+        self.matched(&mut shared, options.check_units, interrupt)
     }
 
     /// Whether it can be detected.
@@ -223,10 +221,15 @@ impl Model {
         self.normals().ok_or(DetectionError::NoNormals)
     }
 
-    fn matched(&self, shared: &mut Shared<'_>, interrupt: &Interrupt) -> Result<MatchedScan, DetectionError> {
+    fn matched(
+        &self,
+        shared: &mut Shared<'_>,
+        check_units: bool,
+        interrupt: &Interrupt,
+    ) -> Result<MatchedScan, DetectionError> {
         let normals = self.check()?;
         let diameter = self.diameter(interrupt)?;
-        if shared.options.check_units {
+        if check_units {
             doubts::check_units(diameter, &shared.all)?;
         }
         let (num_dropped, num_searched) = (shared.searched.num_dropped, shared.searched.points.len());
@@ -323,12 +326,12 @@ impl Model {
 }
 
 impl MatchedScan {
-    /// What a registrar takes of a scan.
-    fn input<'a>(&'a self, scan: &'a Shared<'_>) -> (Cloud<'a>, Correspondences) {
+    /// What a registrar takes. `scan` is as it was given, `measured` what of it is finite.
+    fn input<'a>(&'a self, scan: &'a Cloud<'_>, measured: &'a [Point3<f64>]) -> (Cloud<'a>, Correspondences) {
         let mut target = Cloud::new(&self.points).with_normals(self.normals.clone());
-        if !scan.viewpoints.is_empty() {
-            target = target.with_viewpoints(scan.viewpoints.clone());
-            target.measured = scan.measurement();
+        if let Some(viewpoint) = scan.viewpoint {
+            target =
+                target.with_viewpoint(viewpoint).with_measured(scan.measured.as_deref().unwrap_or(measured));
         }
         let rows = self.matches.rows.iter().map(|pair| pair.map(|row| row as usize)).collect();
         (target, Correspondences::from_rows(rows).with_similarity(self.matches.similarity.clone()))

@@ -94,11 +94,13 @@ impl Models {
     }
 
     /// In the order in which they were given.
+    #[must_use]
     pub fn names(&self) -> impl ExactSizeIterator<Item = &str> {
         self.parts.iter().map(|(name, _)| name.as_str())
     }
 
     /// In the order in which they were given.
+    #[must_use]
     pub fn models(&self) -> impl ExactSizeIterator<Item = &Arc<Model>> {
         self.parts.iter().map(|(_, model)| model)
     }
@@ -138,11 +140,12 @@ impl Models {
             let mut diameters = self.models().map(|model| model.diameter(&interrupt));
             diameters.try_fold(0.0, |most: f64, diameter| Ok(most.max(diameter?)))
         };
-        let mut shared = match pool.install(|| Shared::new(scan, options, params.oriented_normals, largest)) {
-            Ok(shared) => Some(shared),
-            Err(error) if error.is_interrupted() => None,
-            Err(error) => return Err(error),
-        };
+        let mut shared =
+            match pool.install(|| Shared::new(scan, options.roi.as_ref(), options.remove_plane, largest)) {
+                Ok(shared) => Some(shared),
+                Err(error) if error.is_interrupted() => None,
+                Err(error) => return Err(error),
+            };
         drop(pool);
         let mut is_ended = false;
         let mut parts: Vec<Detection> = Vec::with_capacity(self.parts.len());
@@ -161,7 +164,14 @@ impl Models {
                     is_ended = flow.is_break();
                     flow
                 };
-                model.search(shared, own, begin, |registrar, scan| set_up(at, registrar, scan), &mut until)?
+                model.search(
+                    shared,
+                    options,
+                    own,
+                    begin,
+                    |registrar, scan| set_up(at, registrar, scan),
+                    &mut until,
+                )?
             } else {
                 model.no_time(own, begin, &interrupt)
             };
@@ -180,7 +190,7 @@ impl Models {
         ranking.sort_by(|a, b| score(b).total_cmp(&score(a)));
         let total_s = start.elapsed().as_secs_f64();
         let reasons = || parts.iter().map(|part| part.registration.stop_reason);
-        let stop_reason = match reasons().find(StopReason::is_from_outside).or(reasons().last()) {
+        let stop_reason = match reasons().find(StopReason::is_from_outside).or(reasons().next_back()) {
             Some(StopReason::Timeout { threshold, .. }) => {
                 StopReason::Timeout { value: total_s, threshold: params.timeout_s.unwrap_or(threshold) }
             }
@@ -195,7 +205,7 @@ impl Models {
         let points = &shared.searched.points;
         // Enough to tell a half.
         let scan: Vec<Point3<f64>> = points.iter().copied().step_by(1 + points.len() / MANY_POINTS).collect();
-        let eyes = &shared.viewpoints;
+        let eyes: Vec<Point3<f64>> = shared.scan.viewpoint.into_iter().collect();
         let poses: Vec<(usize, &Pose)> = (0..)
             .zip(&*parts)
             .flat_map(|(at, part)| part.registration.poses.iter().map(move |p| (at, p)))
@@ -210,7 +220,7 @@ impl Models {
             };
             let shape = Shape { points: model.points(), normals: model.normals().unwrap_or_default() };
             let reach = Reach { across, aside: voxel };
-            explained(shape, &pose.target_from_source, eyes, &scan, reach)
+            explained(shape, &pose.target_from_source, &eyes, &scan, reach)
         });
         let rivals = poses.iter().zip(&rows);
         let rivals: Vec<Rival<'_>> =

@@ -3,26 +3,23 @@
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::Point3;
 
+use super::doubts::{self, Doubt};
+use super::error::DetectionError;
 use super::model::describe;
+use super::roi::Roi;
 use super::scan::{Measured, Prepared, Setting};
-use super::standpoints::standpoints;
-use super::{Detect, DetectionError, Doubt, doubts};
 use crate::error::Argument;
 use crate::interrupt::Interrupt;
-use crate::scene::{Cloud, Measurement, check_points};
+use crate::scene::{Cloud, check_points};
 
 /// A scan that was checked, and what was made of it at each voxel that a model has asked for.
 pub(super) struct Shared<'a> {
     pub(super) scan: &'a Cloud<'a>,
-    pub(super) options: &'a Detect,
-    /// From where it was seen; from where it may have been, if that counts and is not known.
-    pub(super) viewpoints: Vec<Point3<f64>>,
+    remove_plane: Option<bool>,
     /// What of the scan is finite.
     pub(super) all: Vec<Point3<f64>>,
-    /// If normals were given.
-    normals_of_all: Option<Vec<Vector3<f64>>>,
     /// What of that is searched: all, or what lies in the region of interest.
     pub(super) searched: Measured,
     /// Of the largest of the models.
@@ -40,17 +37,17 @@ pub(super) struct Ready {
 }
 
 impl<'a> Shared<'a> {
-    /// Checks a scan. `diameter`: of the largest model; `is_sided`: whether it counts which side of a surface is seen.
+    /// Checks a scan, of which what lies in `roi` is searched. `diameter`: of the largest model.
     pub(super) fn new(
         scan: &'a Cloud<'a>,
-        options: &'a Detect,
-        is_sided: bool,
+        roi: Option<&Roi>,
+        remove_plane: Option<bool>,
         diameter: impl FnOnce() -> Result<f64, DetectionError>,
     ) -> Result<Self, DetectionError> {
-        if scan.viewpoints.is_empty() && scan.normals.is_none() {
+        if scan.viewpoint.is_none() && scan.normals.is_none() {
             return Err(DetectionError::NoSide);
         }
-        if let Some(roi) = &options.roi {
+        if let Some(roi) = roi {
             roi.check()?;
         }
         let measured = Measured::of(&scan.points, scan.normals.as_deref())?;
@@ -60,65 +57,26 @@ impl<'a> Shared<'a> {
             return Err(DetectionError::MostNormalsMissing { num_missing, len });
         }
         let diameter = diameter()?;
-        let viewpoints = match &measured.normals {
-            Some(normals) if scan.viewpoints.is_empty() && is_sided => {
-                standpoints(&measured.points, normals, diameter)
-            }
-            _ => scan.viewpoints.clone(),
-        };
         let all = measured.points.clone();
-        let normals_of_all = measured.normals.clone();
-        let searched = match &options.roi {
+        let searched = match roi {
             Some(roi) => measured.within(|point| roi.contains(point)),
             None => measured,
         };
-        Ok(Self {
-            scan,
-            options,
-            viewpoints,
-            all,
-            normals_of_all,
-            searched,
-            diameter,
-            ready: BTreeMap::new(),
-        })
-    }
-
-    /// About where it was seen from.
-    pub(super) fn middle_of_viewpoints(&self) -> Option<Point3<f64>> {
-        let sum: Vector3<f64> = self.viewpoints.iter().map(|eye| eye.coords).sum();
-        (!self.viewpoints.is_empty()).then(|| Point3::from(sum / self.viewpoints.len() as f64))
-    }
-
-    /// All that the cameras measured: as it was given, or all of the scan.
-    pub(super) fn measurement(&self) -> Measurement<'_> {
-        match &self.scan.measured.parts[..] {
-            [] => Measurement { parts: vec![self.all[..].into()], normals: self.normals_of_all.clone() },
-            _ => self.scan.measured.clone(),
-        }
+        Ok(Self { scan, remove_plane, all, searched, diameter, ready: BTreeMap::new() })
     }
 
     /// What it is at the voxel of a model.
     pub(super) fn at(&mut self, voxel: f64, interrupt: &Interrupt) -> Result<&mut Ready, DetectionError> {
-        let viewpoint = self.middle_of_viewpoints();
+        let viewpoint = self.scan.viewpoint;
         match self.ready.entry(voxel.to_bits()) {
             Entry::Occupied(ready) => Ok(ready.into_mut()),
             Entry::Vacant(place) => {
-                let setting = Setting {
-                    voxel,
-                    diameter: self.diameter,
-                    viewpoint,
-                    remove_plane: self.options.remove_plane,
-                };
-                let mut prepared = Prepared::new(&self.searched, &setting, interrupt)?;
-                let given = &self.scan.viewpoints;
-                if given.len() > 1 && self.scan.normals.is_none() {
-                    prepared.turn_to_eyes(given, &self.scan.measured.parts);
-                }
-                let is_behind = (prepared.is_behind_table && !given.is_empty()).then_some(Doubt::BehindPlane);
-                let doubt = is_behind.or_else(|| match given[..] {
-                    [eye] => doubts::of_viewpoint(&eye, &prepared),
-                    _ => None,
+                let setting =
+                    Setting { voxel, diameter: self.diameter, viewpoint, remove_plane: self.remove_plane };
+                let prepared = Prepared::new(&self.searched, &setting, interrupt)?;
+                let doubt = viewpoint.and_then(|eye| {
+                    let is_behind = prepared.is_behind_table.then_some(Doubt::BehindPlane);
+                    is_behind.or_else(|| doubts::of_viewpoint(&eye, &prepared))
                 });
                 Ok(place.insert(Ready { prepared, doubt, described: None }))
             }
