@@ -9,7 +9,7 @@ use super::doubts::{self, Doubt};
 use super::model::{DIM, Model};
 use super::roi::Roi;
 use super::scan::standing;
-use super::shared::Shared;
+use super::shared::{Shared, Wanted};
 use super::{DetectionError, Origin, Run, VOXELS_PER_SPACING, sides};
 use crate::features::{Descriptors, FeatureError, Matches, Matching, match_features};
 use crate::interrupt::Interrupt;
@@ -19,6 +19,9 @@ use crate::registrar::{Observer, Registrar};
 use crate::registration::Registration;
 use crate::scene::{Cloud, Correspondences};
 use crate::stop::StopReason;
+
+/// A scan of more cameras is one that was walked around.
+const FEW_VIEWPOINTS: usize = 4;
 
 /// Nearest model points that each scene point is joined to: walls and edges repeat on a part.
 const PER_POINT: usize = 4;
@@ -33,7 +36,8 @@ const MIN_POINTS: usize = 3;
 /// How a model is looked for in a scan.
 #[derive(Debug, Clone)]
 pub struct Detect {
-    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with a viewpoint, else the default.
+    /// `timeout_s` counts from the call. `None`: [`Params::single_view`] with one to four viewpoints, else
+    /// [`Params::many_views`].
     pub params: Option<Params>,
     /// Whether the plane with most points is taken away. `None`: where it looks like a table, with less than 2 % of the
     /// points behind it as the viewpoint sees it.
@@ -54,12 +58,15 @@ impl Default for Detect {
 }
 
 impl Detect {
+    pub(super) fn wanted(&self, is_sided: bool) -> Wanted<'_> {
+        Wanted { roi: self.roi.as_ref(), remove_plane: self.remove_plane, is_sided }
+    }
+
     /// Those that were given, or those that fit the scan; checked.
     pub(super) fn params_for(&self, scan: &Cloud<'_>) -> Result<Params, DetectionError> {
-        let params = self.params.clone().unwrap_or_else(|| match scan.viewpoint {
-            Some(_) => Params::single_view(),
-            None => Params::default(),
-        });
+        let is_few = (1..=FEW_VIEWPOINTS).contains(&scan.viewpoints.len());
+        let preset = || if is_few { Params::single_view() } else { Params::many_views() };
+        let params = self.params.clone().unwrap_or_else(preset);
         params.validate()?;
         Ok(params)
     }
@@ -136,9 +143,8 @@ impl Model {
         self.check()?;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
-        let shared = pool.install(|| {
-            Shared::new(scan, options.roi.as_ref(), options.remove_plane, || Ok(self.diameter(&interrupt)?))
-        });
+        let wanted = options.wanted(params.oriented_normals);
+        let shared = pool.install(|| Shared::new(scan, wanted, || Ok(self.diameter(&interrupt)?)));
         drop(pool);
         match shared {
             Ok(mut shared) => self.search(&mut shared, options, params, start, set_up, observer),
@@ -176,7 +182,7 @@ impl Model {
             let timeout_s = params.timeout_s.map(|limit| (limit - spent_s).max(0.0));
             let limited = Params { timeout_s, ..params.clone() };
             let registrar = options.run.registrar(Registrar::of(self.source().clone()).params(limited));
-            let (target, correspondences) = matched.input(shared.scan, &shared.all);
+            let (target, correspondences) = matched.input(shared);
             let registrar = set_up(registrar, &matched);
             let mut found = registrar.register_observed(&target, &correspondences, observer)?;
             if let StopReason::Timeout { value, threshold } = &mut found.stop_reason {
@@ -188,7 +194,7 @@ impl Model {
         let is_over = registration.stop_reason.is_from_outside();
         let searched = &shared.searched.points;
         let of_units = if registration.poses.is_empty() && searched.len() >= doubts::ENOUGH && !is_over {
-            pool()?.install(|| self.unit_doubt(shared.scan.viewpoint, searched, &interrupt))?
+            pool()?.install(|| self.unit_doubt(shared.middle_of_viewpoints(), searched, &interrupt))?
         } else {
             None
         };
@@ -211,8 +217,7 @@ impl Model {
         interrupt: &Interrupt,
     ) -> Result<MatchedScan, DetectionError> {
         self.check()?;
-        let mut shared =
-            Shared::new(scan, options.roi.as_ref(), options.remove_plane, || Ok(self.diameter(interrupt)?))?;
+        let mut shared = Shared::new(scan, options.wanted(false), || Ok(self.diameter(interrupt)?))?;
         self.matched(&mut shared, options.check_units, interrupt)
     }
 
@@ -326,12 +331,12 @@ impl Model {
 }
 
 impl MatchedScan {
-    /// What a registrar takes. `scan` is as it was given, `measured` what of it is finite.
-    fn input<'a>(&'a self, scan: &'a Cloud<'_>, measured: &'a [Point3<f64>]) -> (Cloud<'a>, Correspondences) {
+    /// What a registrar takes of a scan.
+    fn input<'a>(&'a self, scan: &'a Shared<'_>) -> (Cloud<'a>, Correspondences) {
         let mut target = Cloud::new(&self.points).with_normals(self.normals.clone());
-        if let Some(viewpoint) = scan.viewpoint {
-            target =
-                target.with_viewpoint(viewpoint).with_measured(scan.measured.as_deref().unwrap_or(measured));
+        if !scan.viewpoints.is_empty() {
+            target = target.with_viewpoints(scan.viewpoints.clone());
+            target.measured = scan.measurement();
         }
         let rows = self.matches.rows.iter().map(|pair| pair.map(|row| row as usize)).collect();
         (target, Correspondences::from_rows(rows).with_similarity(self.matches.similarity.clone()))

@@ -141,7 +141,7 @@ impl Models {
             diameters.try_fold(0.0, |most: f64, diameter| Ok(most.max(diameter?)))
         };
         let mut shared =
-            match pool.install(|| Shared::new(scan, options.roi.as_ref(), options.remove_plane, largest)) {
+            match pool.install(|| Shared::new(scan, options.wanted(params.oriented_normals), largest)) {
                 Ok(shared) => Some(shared),
                 Err(error) if error.is_interrupted() => None,
                 Err(error) => return Err(error),
@@ -205,7 +205,7 @@ impl Models {
         let points = &shared.searched.points;
         // Enough to tell a half.
         let scan: Vec<Point3<f64>> = points.iter().copied().step_by(1 + points.len() / MANY_POINTS).collect();
-        let eyes: Vec<Point3<f64>> = shared.scan.viewpoint.into_iter().collect();
+        let eyes = &shared.viewpoints;
         let poses: Vec<(usize, &Pose)> = (0..)
             .zip(&*parts)
             .flat_map(|(at, part)| part.registration.poses.iter().map(move |p| (at, p)))
@@ -220,7 +220,7 @@ impl Models {
             };
             let shape = Shape { points: model.points(), normals: model.normals().unwrap_or_default() };
             let reach = Reach { across, aside: voxel };
-            explained(shape, &pose.target_from_source, &eyes, &scan, reach)
+            explained(shape, &pose.target_from_source, eyes, &scan, reach)
         });
         let rivals = poses.iter().zip(&rows);
         let rivals: Vec<Rival<'_>> =

@@ -3,28 +3,43 @@
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 
 use super::doubts::{self, Doubt};
 use super::error::DetectionError;
 use super::model::describe;
 use super::roi::Roi;
 use super::scan::{Measured, Prepared, Setting};
+use super::standpoints::standpoints;
 use crate::error::Argument;
 use crate::interrupt::Interrupt;
-use crate::scene::{Cloud, check_points};
+use crate::scene::{Cloud, Measurement, check_points};
 
 /// A scan that was checked, and what was made of it at each voxel that a model has asked for.
 pub(super) struct Shared<'a> {
     pub(super) scan: &'a Cloud<'a>,
     remove_plane: Option<bool>,
+    /// From where it was seen; from where it may have been, if that counts and is not known.
+    pub(super) viewpoints: Vec<Point3<f64>>,
     /// What of the scan is finite.
     pub(super) all: Vec<Point3<f64>>,
+    /// If normals were given.
+    normals_of_all: Option<Vec<Vector3<f64>>>,
     /// What of that is searched: all, or what lies in the region of interest.
     pub(super) searched: Measured,
     /// Of the largest of the models.
     diameter: f64,
     ready: BTreeMap<u64, Ready>,
+}
+
+/// What is wanted of a scan.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wanted<'a> {
+    /// What lies in it is searched.
+    pub(super) roi: Option<&'a Roi>,
+    pub(super) remove_plane: Option<bool>,
+    /// Whether it counts which side of a surface was seen.
+    pub(super) is_sided: bool,
 }
 
 /// A scan at a voxel.
@@ -37,14 +52,13 @@ pub(super) struct Ready {
 }
 
 impl<'a> Shared<'a> {
-    /// Checks a scan, of which what lies in `roi` is searched. `diameter`: of the largest model.
+    /// Checks a scan. `diameter`: of the largest model.
     pub(super) fn new(
         scan: &'a Cloud<'a>,
-        roi: Option<&Roi>,
-        remove_plane: Option<bool>,
+        Wanted { roi, remove_plane, is_sided }: Wanted<'_>,
         diameter: impl FnOnce() -> Result<f64, DetectionError>,
     ) -> Result<Self, DetectionError> {
-        if scan.viewpoint.is_none() && scan.normals.is_none() {
+        if scan.viewpoints.is_empty() && scan.normals.is_none() {
             return Err(DetectionError::NoSide);
         }
         if let Some(roi) = roi {
@@ -57,26 +71,61 @@ impl<'a> Shared<'a> {
             return Err(DetectionError::MostNormalsMissing { num_missing, len });
         }
         let diameter = diameter()?;
+        let viewpoints = match &measured.normals {
+            Some(normals) if scan.viewpoints.is_empty() && is_sided => {
+                standpoints(&measured.points, normals, diameter)
+            }
+            _ => scan.viewpoints.clone(),
+        };
         let all = measured.points.clone();
+        let normals_of_all = measured.normals.clone();
         let searched = match roi {
             Some(roi) => measured.within(|point| roi.contains(point)),
             None => measured,
         };
-        Ok(Self { scan, remove_plane, all, searched, diameter, ready: BTreeMap::new() })
+        Ok(Self {
+            scan,
+            remove_plane,
+            viewpoints,
+            all,
+            normals_of_all,
+            searched,
+            diameter,
+            ready: BTreeMap::new(),
+        })
+    }
+
+    /// About where it was seen from.
+    pub(super) fn middle_of_viewpoints(&self) -> Option<Point3<f64>> {
+        let sum: Vector3<f64> = self.viewpoints.iter().map(|eye| eye.coords).sum();
+        (!self.viewpoints.is_empty()).then(|| Point3::from(sum / self.viewpoints.len() as f64))
+    }
+
+    /// All that the cameras measured: as it was given, or all of the scan.
+    pub(super) fn measurement(&self) -> Measurement<'_> {
+        match &self.scan.measured.parts[..] {
+            [] => Measurement { parts: vec![self.all[..].into()], normals: self.normals_of_all.clone() },
+            _ => self.scan.measured.clone(),
+        }
     }
 
     /// What it is at the voxel of a model.
     pub(super) fn at(&mut self, voxel: f64, interrupt: &Interrupt) -> Result<&mut Ready, DetectionError> {
-        let viewpoint = self.scan.viewpoint;
+        let viewpoint = self.middle_of_viewpoints();
         match self.ready.entry(voxel.to_bits()) {
             Entry::Occupied(ready) => Ok(ready.into_mut()),
             Entry::Vacant(place) => {
                 let setting =
                     Setting { voxel, diameter: self.diameter, viewpoint, remove_plane: self.remove_plane };
-                let prepared = Prepared::new(&self.searched, &setting, interrupt)?;
-                let doubt = viewpoint.and_then(|eye| {
-                    let is_behind = prepared.is_behind_table.then_some(Doubt::BehindPlane);
-                    is_behind.or_else(|| doubts::of_viewpoint(&eye, &prepared))
+                let mut prepared = Prepared::new(&self.searched, &setting, interrupt)?;
+                let given = &self.scan.viewpoints;
+                if given.len() > 1 && self.scan.normals.is_none() {
+                    prepared.turn_to_eyes(given, &self.scan.measured.parts);
+                }
+                let is_behind = (prepared.is_behind_table && !given.is_empty()).then_some(Doubt::BehindPlane);
+                let doubt = is_behind.or_else(|| match given[..] {
+                    [eye] => doubts::of_viewpoint(&eye, &prepared),
+                    _ => None,
                 });
                 Ok(place.insert(Ready { prepared, doubt, described: None }))
             }
