@@ -6,7 +6,7 @@ use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
 use super::noise::noise_of_rays;
 use super::odds::{BLURRED, Measures};
 use super::rays::Rays;
-use super::seen::{Look, Seen, Tally, Tolerance, merge, sight};
+use super::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
 use super::settle::{Steps, settle};
 use super::slip::{information, losses, moved, principal_motions, worth};
 use crate::detail::Detail;
@@ -193,5 +193,43 @@ fn information_of(scene: &Scene<'_>, pose: &Isometry3<f64>, at: &At) -> Option<(
 impl At {
     fn placed<'a>(&'a self, target_from_source: &'a Isometry3<f64>) -> Placed<'a> {
         Placed { target_from_source, points: &self.points, normals: &self.normals, sight: &self.sight }
+    }
+}
+
+/// What the last polish asks.
+impl Closeup {
+    pub(super) fn rays(&self) -> &[Rays] {
+        &self.rays
+    }
+
+    pub(super) fn voxel(&self) -> f64 {
+        self.voxel
+    }
+
+    pub(super) fn noise(&self) -> f64 {
+        self.noise
+    }
+
+    pub(super) fn tolerance(&self) -> Tolerance {
+        self.tolerance
+    }
+
+    /// Where faces end that were measured, and the eyes see past them: points of the model, moved, and unit vectors across its rim,
+    /// outwards.
+    pub(super) fn ends(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Vec<(Point3<f64>, Vector3<f64>)> {
+        let at = self.at(scene, pose, 1);
+        let mut ends = Vec::new();
+        for (&row, offset) in self.rim.rows.iter().zip(&self.rim.offsets) {
+            let (row, offset) = (row as usize, pose.rotation * offset);
+            if at.sight[row].seen != Seen::Supported {
+                continue;
+            }
+            let place = at.points[row] + offset;
+            let past = self.rays.iter().map(|rays| look(rays, &place, &at.normals[row], self.tolerance).seen);
+            if past.max() == Some(Seen::Contradicted) {
+                ends.push((at.points[row], offset.normalize()));
+            }
+        }
+        ends
     }
 }
