@@ -1,6 +1,6 @@
 //! Poses at full resolution: polished on all that was measured, and how well they are known.
 
-use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
+use nalgebra::{Isometry3, Matrix6, Point3, Vector3, Vector6};
 
 use super::closeup::Closeup;
 use super::polish::{Faces, Hold, Measured, Polished, Touch, polish, touches, weight};
@@ -56,8 +56,12 @@ const SAME_SIDE_COS: f64 = 0.5;
 const ROUND_COS: f64 = 0.9;
 const ROUND_SPACINGS: f64 = 2.0;
 
-/// Standard deviation, across the ends of faces and over all of them, to which a close look has settled a pose, voxels.
-const ENDS_VOXELS: f64 = 0.15;
+/// Standard deviation, voxels, to which a close look settles a motion that moves all ends of faces across themselves. It counts
+/// points: of one that moves a part of the ends as much less is seen, and so it is known as much less.
+const ENDS_VOXELS: f64 = 0.06;
+
+/// Standard deviation of what a model of samples is off by, at a point as far from the centre as it reaches; voxels.
+const MODEL_VOXELS: f64 = 0.02;
 
 /// Fewer ends say nothing.
 const FEW_ENDS: usize = 6;
@@ -204,27 +208,35 @@ impl Fitted {
         // What was fitted has taken a part of what the points lay off.
         let left = (1.0 - FREEDOMS * sharing / self.pairs.num.max(1.0)).max(0.0);
         let information = self.planes * (left / sharing) + self.ends;
+        let model = self.tolerance * MODEL_VOXELS / FREE_VOXELS;
+        let turn = model / self.size;
+        let model = Vector6::new(turn, turn, turn, model, model, model).map(|deviation| deviation * deviation);
         Known {
-            covariance: covariance(&information, self.size),
+            covariance: covariance(&information, self.size) + Matrix6::from_diagonal(&model),
             free_motions: free_motions(&information, &self.centre, self.size, self.tolerance),
         }
     }
 }
 
-/// The information of the ends of faces that the eyes see past: `ENDS_VOXELS` is how far the pose is off across them.
+/// The information of the ends of faces that the eyes see past.
 fn ends_of(closeup: &Closeup, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Matrix6<f64> {
     let centre = pose * scene.source.centre;
     let ends = closeup.ends(scene, pose);
+    if ends.len() < FEW_ENDS {
+        return Matrix6::zeros();
+    }
     let mut sum = Matrix6::zeros();
     for (at, outwards) in &ends {
         let j = jacobian(at, outwards, &centre);
         sum.syger(1.0, &j, &j, 1.0);
     }
     sum.fill_upper_triangle_with_lower_triangle();
-    if ends.len() < FEW_ENDS {
-        return Matrix6::zeros();
-    }
-    sum / (ends.len() as f64 * (ENDS_VOXELS * closeup.voxel()).powi(2))
+    let size = scene.source.radius;
+    // As shares of all ends, turns measured at a size from the centre.
+    let unit = Matrix6::from_diagonal(&Vector6::new(size, size, size, 1.0, 1.0, 1.0));
+    let share = Matrix6::from_diagonal(&unit.map_diagonal(f64::recip));
+    let shares = share * sum * share / ends.len() as f64;
+    unit * shares * shares * unit / (ENDS_VOXELS * closeup.voxel()).powi(2)
 }
 
 /// Normals of a surface that is round where the faces of a mesh are turned a little against each other.

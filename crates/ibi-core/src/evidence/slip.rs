@@ -94,7 +94,7 @@ pub fn principal_motions(information: &Matrix6<f64>, size: f64) -> [(Vector6<f64
 
 /// A motion that costs nothing.
 #[derive(Debug, Clone, Copy, PartialEq)]
-#[cfg_attr(feature = "serde", derive(serde::Serialize))]
+#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
 pub enum FreeMotion {
     /// A slide along a unit vector.
     Slide {
