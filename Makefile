@@ -100,6 +100,10 @@ bench-piles: $(STAMPS)/package $(STAMPS)/group-test $(STAMPS)/open3d peers pcl #
 bench-verdict: $(STAMPS)/package $(STAMPS)/open3d ## whether scores are true in bins, rows, rooms, on real scans; ARGS=--quick, --docs records (needs Open3D)
 	$(BIN)/python benchmarks/verdict.py $(ARGS)
 
+.PHONY: bench-covariance
+bench-covariance: $(STAMPS)/package $(STAMPS)/open3d ## whether poses are as far off as they say, in bins and alone; ARGS=--detect (needs Open3D)
+	$(BIN)/python benchmarks/covariance.py $(ARGS)
+
 .PHONY: bench-speed
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py

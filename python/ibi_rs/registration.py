@@ -96,6 +96,11 @@ class FreeMotion:
     point: npt.NDArray[np.float64] | None = None
     pitch: float = 0.0
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain numbers and lists, for JSON."""
+        point = None if self.point is None else self.point.tolist()
+        return {"kind": self.kind, "direction": self.direction.tolist(), "point": point, "pitch": self.pitch}
+
     @classmethod
     def _of(cls, raw: dict[str, Any]) -> FreeMotion:
         ((kind, of),) = raw.items()

@@ -3,9 +3,9 @@
 use nalgebra::{Isometry3, Matrix6, Point3, Vector3, Vector6};
 
 use super::closeup::Closeup;
-use super::polish::{Faces, Hold, Measured, Polished, Touch, polish, touches, weight};
+use super::polish::{Faces, Hold, Measured, Polished, Touch, information, polish, touches, weight};
 use super::shared::{Correlation, Off, Pairs, pairs};
-use super::slip::{FreeMotion, covariance, free_motions, jacobian};
+use super::slip::{FreeMotion, covariance, free_motions, jacobian, principal_motions};
 use crate::kernels::nearby::{Nearby, spacing};
 use crate::scene::Scene;
 
@@ -61,13 +61,16 @@ const ROUND_SPACINGS: f64 = 2.0;
 const ENDS_VOXELS: f64 = 0.06;
 
 /// Standard deviation of what a model of samples is off by, at a point as far from the centre as it reaches; voxels.
-const MODEL_VOXELS: f64 = 0.02;
+const MODEL_VOXELS: f64 = 0.005;
 
 /// Fewer ends say nothing.
 const FEW_ENDS: usize = 6;
 
 /// A motion is free that is not known to a voxel.
 const FREE_VOXELS: f64 = 1.0;
+
+/// Standard deviation of the normals of a round surface that is made of samples.
+const TILT_RAD: f64 = 0.05;
 
 const FREEDOMS: f64 = 6.0;
 
@@ -115,31 +118,31 @@ impl Fine {
         let ends = ends_of(closeup, scene, pose);
         let hold =
             Hold { centre, size, information: ends, across, most: voxel, noise: 0.5 * closeup.noise() };
-        let Polished { target_from_source, touches, cutoff } =
-            polish(&self.faces(), &measured, pose, &hold)?;
+        let polished = polish(&self.faces(), &measured, pose, &hold)?;
+        let target_from_source = polished.target_from_source;
         let moved_centre = target_from_source * centre;
-        let (mut planes, mut weights, mut slope, mut square) = (Matrix6::zeros(), 0.0, 0.0, 0.0);
         let mut all = Pairs::default();
         let mut from = 0;
         for (eye, to) in self.eyes.iter().zip(ends_at) {
-            let mut offs = Vec::new();
-            for (ray, touch) in measured[from..to].iter().zip(&touches[from..to]) {
-                let Some(Touch { gap, normal }) = *touch else { continue };
-                let (weight, part) = (weight(gap, cutoff), (gap / cutoff).powi(2));
-                let j = jacobian(&ray.at, &normal, &moved_centre);
-                planes.syger(weight, &j, &j, 1.0);
-                weights += weight;
-                slope += (1.0 - part) * (1.0 - 5.0 * part);
-                square += (weight * gap).powi(2);
-                offs.push(Off { ray: Point3::from(-ray.to_eye / eye.spacing), normal, gap: weight * gap });
-            }
+            let off = |(ray, touch): (&Measured, &Option<Touch>)| {
+                let Touch { gap, normal } = (*touch)?;
+                let ray = Point3::from(-ray.to_eye / eye.spacing);
+                Some(Off { ray, normal, gap: weight(gap, polished.cutoff) * gap })
+            };
+            let offs: Vec<Off> =
+                measured[from..to].iter().zip(&polished.touches[from..to]).filter_map(off).collect();
             all = all.and(&pairs(&offs));
             from = to;
         }
-        planes.fill_upper_triangle_with_lower_triangle();
-        // Of a robust fit (Huber 1964): (mean slope)^2 / mean square for each point.
-        let strength = if square > 0.0 { slope.max(0.0).powi(2) / square } else { 0.0 };
-        let planes = planes * (strength / weights.max(f64::MIN_POSITIVE));
+        let planes = information(&measured, &polished, &moved_centre);
+        // Planes that are turned a little would tell of motions that they do not hold: a rod's turn about its axis.
+        let along = |axis: usize| {
+            let mut touches = polished.touches.clone();
+            touches.iter_mut().flatten().for_each(|touch| touch.normal = Vector3::ith(axis, 1.0));
+            information(&measured, &Polished { touches, ..polished.clone() }, &moved_centre)
+        };
+        let all_ways: Matrix6<f64> = (0..3).map(along).sum();
+        let planes = above_zero(&(planes - (all_ways - planes) * TILT_RAD.powi(2)), size);
         let tolerance = FREE_VOXELS * voxel;
         Some(Fitted { target_from_source, pairs: all, planes, ends, centre: moved_centre, size, tolerance })
     }
@@ -210,7 +213,8 @@ impl Fitted {
         let information = self.planes * (left / sharing) + self.ends;
         let model = self.tolerance * MODEL_VOXELS / FREE_VOXELS;
         let turn = model / self.size;
-        let model = Vector6::new(turn, turn, turn, model, model, model).map(|deviation| deviation * deviation);
+        let model =
+            Vector6::new(turn, turn, turn, model, model, model).map(|deviation| deviation * deviation);
         Known {
             covariance: covariance(&information, self.size) + Matrix6::from_diagonal(&model),
             free_motions: free_motions(&information, &self.centre, self.size, self.tolerance),
@@ -237,6 +241,20 @@ fn ends_of(closeup: &Closeup, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Matri
     let share = Matrix6::from_diagonal(&unit.map_diagonal(f64::recip));
     let shares = share * sum * share / ends.len() as f64;
     unit * shares * shares * unit / (ENDS_VOXELS * closeup.voxel()).powi(2)
+}
+
+/// The information without what is below zero of it.
+fn above_zero(information: &Matrix6<f64>, size: f64) -> Matrix6<f64> {
+    principal_motions(information, size)
+        .iter()
+        .filter(|(_, deviation)| deviation.is_finite())
+        .map(|(motion, deviation)| {
+            // Of unit length where turns count a size: so its transpose is its inverse.
+            let turn = size * size;
+            let held = motion.component_mul(&Vector6::new(turn, turn, turn, 1.0, 1.0, 1.0)) / *deviation;
+            held * held.transpose()
+        })
+        .sum()
 }
 
 /// Normals of a surface that is round where the faces of a mesh are turned a little against each other.

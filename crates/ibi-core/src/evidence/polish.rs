@@ -191,6 +191,25 @@ pub fn polish(
     is_enough.then_some(Polished { target_from_source, touches, cutoff })
 }
 
+/// The information of polished points on a motion about `centre`, as if the error of each were its own: of a robust fit (Huber
+/// 1964), (mean slope)^2 / mean square of what counts of the gaps, for each point.
+#[must_use]
+pub fn information(measured: &[Measured], polished: &Polished, centre: &Point3<f64>) -> Matrix6<f64> {
+    let (mut planes, mut weights, mut slope, mut square) = (Matrix6::zeros(), 0.0, 0.0, 0.0);
+    for (ray, touch) in measured.iter().zip(&polished.touches) {
+        let Some(Touch { gap, normal }) = *touch else { continue };
+        let (weight, part) = (weight(gap, polished.cutoff), (gap / polished.cutoff).powi(2));
+        let j = jacobian(&ray.at, &normal, centre);
+        planes.syger(weight, &j, &j, 1.0);
+        weights += weight;
+        slope += (1.0 - part) * (1.0 - 5.0 * part);
+        square += (weight * gap).powi(2);
+    }
+    planes.fill_upper_triangle_with_lower_triangle();
+    let strength = if square > 0.0 { slope.max(0.0).powi(2) / square } else { 0.0 };
+    planes * (strength / f64::max(weights, f64::MIN_POSITIVE))
+}
+
 /// No point of the model is moved farther by going from one pose to another.
 fn displacement(a: &Isometry3<f64>, b: &Isometry3<f64>, hold: &Hold) -> f64 {
     (a * hold.centre - b * hold.centre).norm() + hold.size * a.rotation.angle_to(&b.rotation)

@@ -82,7 +82,8 @@ impl Rays {
     /// All measured points, by row.
     #[must_use]
     pub fn all(&self) -> Vec<Point3<f64>> {
-        let of_side = |side: &Side| side.rows.iter().copied().zip(side.ends.iter().copied()).collect::<Vec<_>>();
+        let of_side =
+            |side: &Side| side.rows.iter().copied().zip(side.ends.iter().copied()).collect::<Vec<_>>();
         let mut all: Vec<(u32, Vector3<f64>)> = self.sides.iter().flat_map(of_side).collect();
         all.sort_unstable_by_key(|&(row, _)| row);
         // Those at the edge of a side are in both.
