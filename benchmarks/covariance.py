@@ -4,10 +4,10 @@
     python benchmarks/covariance.py --half tuning --scenes 6
     python benchmarks/covariance.py --detect --scenes 2
 
-Bins of four kinds with four of each, and each kind alone in a bin (`ibi_rs.synth.bin_scene`); a pixel sees 0.8 mm, the noise
-is 0.5 mm, half of it shared by neighbouring pixels. Told is of poses within a tenth of the diameter (root mean
-square over the points, modulo symmetry): the square of how far each is off in deviations (Mahalanobis), 6 on
-average where all is well; how far the centre is off; and the share within 2 degrees.
+Bins of four kinds with four of each, and each kind alone in a bin (`ibi_rs.synth.bin_scene`); a pixel sees
+0.8 mm, the noise is 0.5 mm, half of it shared by neighbouring pixels. Told is of poses within a tenth of the
+diameter (root mean square over the points, modulo symmetry): the square of how far each is off in deviations
+(Mahalanobis), 6 on average where all is well; how far the centre is off; and the share within 2 degrees.
 
 Correspondences are those of the truth and half as many at random, of what is visible to 0.4: it is asked how
 good the poses are and not which are found. With --detect they are found by `Model.detect`.
@@ -113,7 +113,10 @@ def rows(where: str, scene: synth.Bin, kinds: tuple[str, ...], detect: bool) -> 
 
 def line(name: str, of: list[Row]) -> tuple[str, ...]:
     """Sum up some poses."""
-    column = {key: np.array([float(row[key] or "nan") for row in of]) for key in ("mahalanobis", "shift_mm", "turn_deg")}
+    column = {
+        key: np.array([float(row[key] or "nan") for row in of])
+        for key in ("mahalanobis", "shift_mm", "turn_deg")
+    }
     far = column["mahalanobis"]
     return (
         name,
@@ -133,7 +136,9 @@ HEAD = ("poses of", "number", "mean", "median", "95 %", "shift mm", "turn deg", 
 def main() -> None:
     """Run, print, record."""
     detect = cli.flag("--detect", "find the poses by Model.detect")
-    args = cli.parse(__doc__, cli.HALF, cli.scenes(12, "bins, and as many of each part alone"), detect, cli.out())
+    args = cli.parse(
+        __doc__, cli.HALF, cli.scenes(12, "bins, and as many of each part alone"), detect, cli.out()
+    )
     cli.machine()
     kinds, first = KINDS[args.half], FIRST_SEED[args.half]
     told: list[Row] = []

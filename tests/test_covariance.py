@@ -30,8 +30,12 @@ def pile():
 def scan(pile, rng):
     """What is near a part; less table is less to wait for."""
     points = pile.points
-    points = points[np.min([np.linalg.norm(points - move(of, MIDDLE), axis=1) for of in pile.poses], axis=0) < 60]
-    return points * (1 + rng.normal(0, NOISE, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True))
+    points = points[
+        np.min([np.linalg.norm(points - move(of, MIDDLE), axis=1) for of in pile.poses], axis=0) < 60
+    ]
+    return points * (
+        1 + rng.normal(0, NOISE, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    )
 
 
 def register(model, points, poses, **how):
@@ -72,7 +76,6 @@ def test_poses_are_as_far_off_as_they_say(found, pile):
             errors.append(off)
             squares.append(off @ np.linalg.solve(pose.covariance, off))
     assert len(squares) >= 50
-    print(np.mean(squares), np.median(np.linalg.norm(np.array(errors)[:, 3:], axis=1)))
     # The mean of six is not had exactly: ends of faces count pixels, which is no normal error.
     assert 3 < np.mean(squares) < 8
     assert np.median(np.linalg.norm(np.array(errors)[:, 3:], axis=1)) < 0.3
@@ -80,7 +83,7 @@ def test_poses_are_as_far_off_as_they_say(found, pile):
 
 def test_a_covariance_is_one(found):
     for pose in found[0]:
-        assert pose.covariance.shape == (6, 6) and pose.covariance.dtype == np.float64
+        assert (pose.covariance.shape, pose.covariance.dtype) == ((6, 6), np.float64)
         assert (np.linalg.eigvalsh(pose.covariance) > 0).all()
         np.testing.assert_allclose(pose.covariance, pose.covariance.T, rtol=1e-9)
         np.testing.assert_allclose(pose.centre, move(pose.target_from_source, MIDDLE), atol=1)
@@ -93,14 +96,15 @@ def test_threads_and_copies_of_the_model_change_nothing(part, pile):
         for model, threads in ((part, 1), (part, 3), (pickle.loads(pickle.dumps(part)), 2))
     )
     for a, b, c in zip(one, two, copied, strict=True):
-        assert (a.target_from_source == b.target_from_source).all() and (a.covariance == b.covariance).all()
-        assert (a.target_from_source == c.target_from_source).all() and (a.covariance == c.covariance).all()
+        for other in (b, c):
+            assert (a.target_from_source == other.target_from_source).all()
+            assert (a.covariance == other.covariance).all()
 
 
 def test_without_all_that_was_measured_nothing_is_said():
     scene = ibi.synth.outlier_layout(seed=1, num_instances=3)
     for pose in ibi.Model(scene.src).register(scene.tgt, scene.corr):
-        assert pose.covariance is None and pose.free_motions == () and pose.centre.shape == (3,)
+        assert (pose.covariance, pose.free_motions, pose.centre.shape) == (None, (), (3,))
 
 
 def test_a_rod_turns_freely_about_its_axis():

@@ -46,6 +46,7 @@ from ibi_rs.variants import (
 
 __all__ = [
     "Evidence",
+    "FreeMotion",
     "Gsac",
     "Gtm",
     "Hough3d",
@@ -57,7 +58,6 @@ __all__ = [
     "LocalGtm",
     "Mac",
     "Matches",
-    "FreeMotion",
     "Measures",
     "Model",
     "Nnsr",

@@ -178,8 +178,8 @@ class Pose:
         viewpoint, or a :class:`View`) and a last polish was made on it; else None. Of a small motion in the
         target's frame about ``centre``, a left perturbation: the true pose is x -> c + exp([w]) (x - c) + t
         after this one. Order: w_x, w_y, w_z (radians), t_x, t_y, t_z (data units). It is for a pose that is
-        right, and says nothing of whether it is: that is what ``score`` is for. What nothing holds is known to
-        within the size of the part. Not in it is what is the same over a whole scan, as a wrong scale.
+        right, and says nothing of whether it is: that is what ``score`` is for. What nothing holds is known
+        to within the size of the part. Not in it is what is the same over a whole scan, as a wrong scale.
     free_motions : tuple of FreeMotion
         The motions that nothing holds, slides first: those whose standard deviation exceeds a voxel, at a
         point as far from the centre as the source reaches. Empty where all are held, and where there is no

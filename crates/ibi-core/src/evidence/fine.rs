@@ -69,8 +69,8 @@ const FEW_ENDS: usize = 6;
 /// A motion is free that is not known to a voxel.
 const FREE_VOXELS: f64 = 1.0;
 
-/// Standard deviation of the normals of a round surface that is made of samples.
-const TILT_RAD: f64 = 0.05;
+/// How far normals of a round surface that is made of faces may be turned: those of 24 around, blended.
+const TILT_RAD: f64 = 0.1;
 
 const FREEDOMS: f64 = 6.0;
 
