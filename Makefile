@@ -104,6 +104,10 @@ bench-verdict: $(STAMPS)/package $(STAMPS)/open3d ## whether scores are true in 
 bench-bins: $(STAMPS)/package $(STAMPS)/open3d ## several kinds of parts alone and together, in bins and on real boxes; ARGS=--quick, --docs records (needs Open3D)
 	$(BIN)/python benchmarks/bins.py $(ARGS)
 
+.PHONY: bench-covariance
+bench-covariance: $(STAMPS)/package $(STAMPS)/open3d ## whether poses are as far off as they say, in bins and alone; ARGS=--detect (needs Open3D)
+	$(BIN)/python benchmarks/covariance.py $(ARGS)
+
 .PHONY: bench-speed
 bench-speed: $(STAMPS)/package $(STAMPS)/open3d ## time whole calls from Python and their growth, write records and a picture (needs Open3D)
 	$(BIN)/python benchmarks/speed.py

@@ -16,7 +16,17 @@ from ibi_rs._ray import RayExecutor
 from ibi_rs._register import register
 from ibi_rs._view import View
 from ibi_rs.params import Params
-from ibi_rs.registration import Measures, Pose, Registration, Rejected, Round, StopReason, Timings, Verdict
+from ibi_rs.registration import (
+    FreeMotion,
+    Measures,
+    Pose,
+    Registration,
+    Rejected,
+    Round,
+    StopReason,
+    Timings,
+    Verdict,
+)
 from ibi_rs.symmetries import Symmetries, find_symmetries
 from ibi_rs.variants import (
     Evidence,
@@ -39,6 +49,7 @@ from ibi_rs.variants import (
 __all__ = [
     "Box",
     "Evidence",
+    "FreeMotion",
     "Gsac",
     "Gtm",
     "Hough3d",

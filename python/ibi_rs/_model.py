@@ -92,8 +92,9 @@ class Model:
         frames: _Floats | None,
         symmetries: Symmetries,
         mesh_voxel: tuple[float, bool] | None = None,
+        fine: tuple[_Floats, _Floats] | None = None,
     ) -> None:
-        self._core = _core.Model(points, normals, frames, symmetries._held, mesh_voxel)
+        self._core = _core.Model(points, normals, frames, symmetries._held, mesh_voxel, fine)
         self._symmetries = symmetries
         # Copies: the caller's arrays may change, the prepared model does not.
         self._points = _frozen(points.copy())
@@ -234,7 +235,8 @@ class Model:
         return f"Model({len(self)} points, {normals} normals, spacing {significant(self.spacing)})"
 
     def __getstate__(self) -> tuple[Any, ...]:
-        return self._points, self._normals, self._frames, self._symmetries, self._core.mesh_voxel
+        core = self._core
+        return self._points, self._normals, self._frames, self._symmetries, core.mesh_voxel, core.fine()
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self._hold(*state)

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, overload
 
 import numpy as np
@@ -73,6 +73,41 @@ class Measures:
             closeness=raw["closeness"],
             evidence=raw["evidence"],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FreeMotion:
+    """A motion of a pose that nothing holds.
+
+    Attributes
+    ----------
+    kind : str
+        ``slide`` along the direction, or ``turn`` about an axis along it.
+    direction : (3,) float64
+        Unit vector, up to sign; target's frame.
+    point : (3,) float64 or None
+        The point of the axis that is nearest to the pose's ``centre``, target's frame, data units; None for a
+        slide.
+    pitch : float
+        How far a turn of one radian slides along the axis, data units: 0 for a slide and a plain turn.
+    """
+
+    kind: str
+    direction: npt.NDArray[np.float64]
+    point: npt.NDArray[np.float64] | None = None
+    pitch: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain numbers and lists, for JSON."""
+        point = None if self.point is None else self.point.tolist()
+        return {"kind": self.kind, "direction": self.direction.tolist(), "point": point, "pitch": self.pitch}
+
+    @classmethod
+    def _of(cls, raw: dict[str, Any]) -> FreeMotion:
+        ((kind, of),) = raw.items()
+        if kind == "slide":
+            return cls(kind, np.array(of["along"]))
+        return cls(kind, np.array(of["about"]), np.array(of["through"]), of["pitch"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +182,20 @@ class Pose:
         Index of its model, 0 where there is but one.
     model_name : str or None
         Its name in :class:`Models`.
+    centre : (3,) float64
+        c, the centre of the source's bounding box where the pose puts it: ``target_from_source`` applied to
+        the middle of the least and the largest source coordinates. Target's frame, data units.
+    covariance : (6, 6) float64 or None
+        How far the pose may be off, where all that a camera measured was given (:meth:`Model.detect` with a
+        viewpoint, or a :class:`View`) and a last polish was made on it; else None. Of a small motion in the
+        target's frame about ``centre``, a left perturbation: the true pose is x -> c + exp([w]) (x - c) + t
+        after this one. Order: w_x, w_y, w_z (radians), t_x, t_y, t_z (data units). It is for a pose that is
+        right, and says nothing of whether it is: that is what ``score`` is for. What nothing holds is known
+        to within the size of the part. Not in it is what is the same over a whole scan, as a wrong scale.
+    free_motions : tuple of FreeMotion
+        The motions that nothing holds, slides first: those whose standard deviation exceeds a voxel, at a
+        point as far from the centre as the source reaches. Empty where all are held, and where there is no
+        covariance.
     """
 
     target_from_source: npt.NDArray[np.float64]
@@ -159,6 +208,9 @@ class Pose:
     inliers: npt.NDArray[np.int64] = field(repr=False)
     round: int
     measures: Measures | None = field(default=None, repr=False)
+    centre: npt.NDArray[np.float64] = field(default_factory=partial(np.zeros, 3), repr=False)
+    covariance: npt.NDArray[np.float64] | None = field(default=None, repr=False)
+    free_motions: tuple[FreeMotion, ...] = field(default=(), repr=False)
     model: int = 0
     model_name: str | None = None
 
@@ -340,6 +392,10 @@ class Timings:
     total_s: float
 
 
+def _free_motions(text: str) -> list[tuple[FreeMotion, ...]]:
+    return [tuple(map(FreeMotion._of, of)) for of in json.loads(text)]
+
+
 class Registration(Sequence[Pose]):
     """The instances found, best score first: a sequence of :class:`Pose`.
 
@@ -483,12 +539,11 @@ class Registration(Sequence[Pose]):
     def _of(cls, raw: dict[str, Any], params: Params) -> Registration:
         """Dress what the core gives."""
         measures = [of and Measures._of(of) for of in json.loads(raw["measures"])]
-        columns = [
-            raw[field.name] for field in fields(Pose) if field.name in raw and field.name != "measures"
-        ]
+        raw = {**raw, "measures": measures, "free_motions": _free_motions(raw["free_motions"])}
+        columns = [raw[field.name] for field in fields(Pose) if field.name in raw]
         rejected = zip(raw["rejected_poses"], json.loads(raw["rejected"]), strict=True)
         return cls(
-            list(map(Pose, *columns, measures)),
+            list(map(Pose, *columns)),
             rejected=[
                 Rejected(pose, score, objection, found_in, of and Measures._of(of))
                 for pose, (score, objection, found_in, of) in rejected

@@ -17,6 +17,7 @@ pub(crate) struct Grace<'a> {
 /// Points to look at for each of what is done at the end: some tens of milliseconds.
 pub(crate) const CONTEST: usize = 1 << 18;
 pub(crate) const CHECK: usize = 1 << 19;
+pub(crate) const POLISH: usize = 1 << 22;
 pub(crate) const RANK: usize = 1 << 19;
 
 impl<'a> Grace<'a> {

@@ -58,7 +58,7 @@ mod symmetries;
 
 pub use detail::Detail;
 pub use error::{Argument, Error};
-pub use evidence::{Contour, Measures, Objection, Overrun, Support, Tally};
+pub use evidence::{Contour, FreeMotion, Measures, Objection, Overrun, Support, Tally};
 pub use interrupt::{CancelToken, Interrupt, Phase, Watcher};
 pub use kernels::par::Pool;
 pub use nalgebra;

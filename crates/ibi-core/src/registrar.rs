@@ -306,6 +306,8 @@ impl<'a> Registrar<'a> {
             while state.settle(&stages, &mut grace) > 0 {}
             let mut grace = Grace::new(&interrupt, grace::CHECK, grace.is_over());
             let supports = state.supports(&stages, &mut grace);
+            let mut grace = Grace::new(&interrupt, grace::POLISH, grace.is_over());
+            state.polish_lastly(&mut grace);
             let mut grace = Grace::new(&interrupt, grace::RANK, grace.is_over());
             state.into_registration(stop_reason, &supports, &mut grace)
         })

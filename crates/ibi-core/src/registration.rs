@@ -2,9 +2,9 @@
 
 use std::time::Instant;
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Matrix6, Point3};
 
-use crate::evidence::{Measures, Objection};
+use crate::evidence::{FreeMotion, Measures, Objection};
 use crate::stages::Verdict;
 use crate::stop::StopReason;
 
@@ -109,6 +109,21 @@ pub struct Pose {
     /// What was measured of it close up, if it was: where a scene is seen from one side and judged by
     /// [`crate::stages::hv::Evidence`]. Then the score is theirs.
     pub measures: Option<Measures>,
+    /// c, the centre of the source's bounding box where the pose puts it; target's frame, data units.
+    pub centre: Point3<f64>,
+    /// How far the pose may be off, where all that a camera measured was handed in and a last polish was made on it; else `None`.
+    ///
+    /// Of a small motion in the target's frame about [`Self::centre`] (a *left* perturbation): the true pose is
+    /// x -> c + exp(\[w\]) (x - c) + t after this one. In this order: w_x, w_y, w_z (radians), t_x, t_y, t_z (data units).
+    /// It is for a pose that is right, and says nothing of whether it is: that is what `score` is for.
+    ///
+    /// From the planes of the measured points that the pose explains, with what they lie off and how much of that neighbours
+    /// share, as measured on all poses of the run; and from the ends of faces, which are known to 0.15 voxels. What nothing
+    /// holds is known to within the size of the part. Not in it: what is the same over a whole scan, as a wrong scale.
+    pub covariance: Option<Matrix6<f64>>,
+    /// The motions that nothing holds, slides first: those whose standard deviation exceeds a voxel, at a point as far from the
+    /// centre as the source reaches. Empty where all are held, and where there is no covariance.
+    pub free_motions: Vec<FreeMotion>,
 }
 
 /// A pose that was given up.

@@ -1,7 +1,7 @@
 //! Arrays of numpy to what the core takes, and back.
 
 use ibi_core::features::FeatureError;
-use ibi_core::nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use ibi_core::nalgebra::{Isometry3, Matrix3, Matrix6, Point3, Rotation3, UnitQuaternion, Vector3};
 use ibi_core::{Cloud, Correspondences};
 use numpy::ndarray::{ArrayView2, Axis};
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3};
@@ -144,6 +144,11 @@ pub(crate) fn matrices<'py, 'a>(
 ) -> PyResult<Bound<'py, PyArray3<f64>>> {
     let shape = [motions.len(), 4, 4];
     motions.flat_map(entries).collect::<Vec<_>>().into_pyarray(py).reshape(shape)
+}
+
+/// (6, 6).
+pub(crate) fn square<'py>(py: Python<'py>, matrix: &Matrix6<f64>) -> PyResult<Floats<'py>> {
+    (0..36).map(|i| matrix[(i / 6, i % 6)]).collect::<Vec<_>>().into_pyarray(py).reshape([6, 6])
 }
 
 /// (N, 3).

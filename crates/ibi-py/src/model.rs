@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use ibi_core::detection::{self, FromMesh, MeshSymmetries, Origin, Run};
 use ibi_core::features::FeatureError;
-use ibi_core::nalgebra::Point3;
+use ibi_core::nalgebra::{Point3, Vector3};
 use ibi_core::{CancelToken, Cloud};
 use numpy::{PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -36,7 +36,7 @@ pub(crate) fn run(cancel: CancelToken, num_threads: Option<usize>) -> Run {
 impl Model {
     /// `mesh_voxel`: of what was made of a mesh its voxel, and whether the user gave it.
     #[new]
-    #[pyo3(signature = (points, normals=None, frames=None, symmetries=None, mesh_voxel=None))]
+    #[pyo3(signature = (points, normals=None, frames=None, symmetries=None, mesh_voxel=None, fine=None))]
     fn new(
         py: Python<'_>,
         points: Rows<'_>,
@@ -44,11 +44,15 @@ impl Model {
         frames: Option<PyReadonlyArray3<'_, f64>>,
         symmetries: Option<&Symmetries>,
         mesh_voxel: Option<(f64, bool)>,
+        fine: Option<(Rows<'_>, Rows<'_>)>,
     ) -> PyResult<Self> {
         let cloud = with_normals(Cloud::from(rows3(&points, Point3::new)?), normals.as_ref())?;
         let mut cloud = with_frames(cloud, frames.as_ref())?;
         if let Some(symmetries) = symmetries {
             cloud = cloud.with_symmetries(symmetries.0.clone());
+        }
+        if let Some((points, normals)) = fine {
+            cloud = cloud.with_fine(rows3(&points, Point3::new)?, rows3(&normals, Vector3::new)?);
         }
         let origin = mesh_voxel.map_or(Origin::Cloud, |(voxel, is_given)| Origin::Mesh { voxel, is_given });
         let model = in_background(py, |cancel, _| {
@@ -83,6 +87,13 @@ impl Model {
 
     fn normals<'py>(&self, py: Python<'py>) -> PyResult<Option<Floats<'py>>> {
         self.0.normals().map(|normals| vectors(py, normals.iter().map(|&n| n.into()))).transpose()
+    }
+
+    /// More points of the surface, and their normals.
+    fn fine<'py>(&self, py: Python<'py>) -> PyResult<Option<(Floats<'py>, Floats<'py>)>> {
+        let Some((points, normals)) = &self.0.source().fine else { return Ok(None) };
+        let points = vectors(py, points.iter().map(|&p| p.into()))?;
+        Ok(Some((points, vectors(py, normals.iter().map(|&n| n.into()))?)))
     }
 
     fn symmetries(&self) -> Symmetries {

@@ -10,7 +10,9 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::background::{Caller, in_background};
-use crate::convert::{Rows, correspondences, json, matrices, rows3, with_frames, with_normals};
+use crate::convert::{
+    Rows, correspondences, json, matrices, rows3, square, vectors, with_frames, with_normals,
+};
 use crate::error::{OrPyErr, ToPyErr};
 use crate::model::{Model, run};
 use crate::params;
@@ -130,6 +132,12 @@ pub(crate) fn to_dict<'py>(py: Python<'py>, registration: &Registration) -> PyRe
     result.set_item("round", poses.iter().map(|p| p.round).collect::<Vec<u32>>())?;
     let measures: Vec<_> = poses.iter().map(|p| p.measures).collect();
     result.set_item("measures", json(&measures)?)?;
+    result.set_item("centre", vectors(py, poses.iter().map(|p| p.centre.into()))?)?;
+    let covariances: PyResult<Vec<_>> =
+        poses.iter().map(|p| p.covariance.map(|of| square(py, &of)).transpose()).collect();
+    result.set_item("covariance", covariances?)?;
+    let free: Vec<_> = poses.iter().map(|p| &p.free_motions).collect();
+    result.set_item("free_motions", json(&free)?)?;
     let rejected = &registration.rejected;
     result.set_item("rejected_poses", matrices(py, rejected.iter().map(|r| &r.target_from_source))?)?;
     let told: Vec<_> = rejected.iter().map(|r| (r.score, r.objection, r.round, r.measures)).collect();

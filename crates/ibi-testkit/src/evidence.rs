@@ -144,3 +144,29 @@ pub fn explained(
     };
     (0..).zip(scan).filter(|(_, q)| is_explained(q)).map(|(row, _)| row).collect()
 }
+
+/// How far a measured point, with a unit vector from there to its eye, lies in front of the plane of the nearest of the `model`'s
+/// points, once a pose has moved them; `None` if that is more than `across`, or more than `aside` along the plane, or if the plane is
+/// seen at a cosine of no more than `facing`. And how far that is from another answer.
+#[must_use]
+pub fn touch(
+    (points, normals): (&[Point3<f64>], &[Vector3<f64>]),
+    (at, to_eye): (&Point3<f64>, &Vector3<f64>),
+    pose: &Isometry3<f64>,
+    across: f64,
+    aside: f64,
+    facing: f64,
+) -> (Option<f64>, f64) {
+    let mut order: Vec<(f64, usize)> =
+        points.iter().enumerate().map(|(row, p)| ((pose * p - at).norm(), row)).collect();
+    order.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let (_, row) = order[0];
+    let lead = order.get(1).map_or(f64::INFINITY, |next| next.0 - order[0].0);
+    let (normal, off) = (pose * normals[row], at - pose * points[row]);
+    let gap = off.dot(&normal);
+    let along = (off - gap * normal).norm();
+    let cosine = normal.dot(to_eye);
+    let margins = [lead, (gap.abs() - across).abs(), (along - aside).abs(), (cosine - facing).abs()];
+    let is_on = gap.abs() <= across && along <= aside && cosine > facing;
+    (is_on.then_some(gap), margins.into_iter().fold(f64::INFINITY, f64::min))
+}

@@ -126,6 +126,9 @@ def as_dict(
                 "overlap": pose.overlap,
                 "num_inliers": pose.num_inliers,
                 "inlier_rmse": pose.inlier_rmse,
+                "centre": pose.centre.tolist(),
+                "covariance": None if pose.covariance is None else pose.covariance.tolist(),
+                "free_motions": [free.to_dict() for free in pose.free_motions],
             }
             for pose in found
         ],

@@ -99,7 +99,11 @@ impl Model {
                     find_symmetries(&dense.points, Some(&dense.normals), settings, &interrupt)?
                 }
             };
-            let cloud = Cloud::from(surface.points).with_normals(surface.normals).with_symmetries(symmetries);
+            let (fine, of_fine) = surface.fine;
+            let cloud = Cloud::from(surface.points)
+                .with_normals(surface.normals)
+                .with_symmetries(symmetries)
+                .with_fine(fine, of_fine);
             let origin = Origin::Mesh { voxel: surface.voxel, is_given: options.voxel.is_some() };
             Self::until(&cloud, origin, &interrupt)
         })

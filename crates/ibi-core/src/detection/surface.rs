@@ -57,6 +57,8 @@ pub(super) struct Surface {
     pub(super) points: Vec<Point3<f64>>,
     /// Outwards, of length 1.
     pub(super) normals: Vec<Vector3<f64>>,
+    /// What was thinned: half a voxel apart, with the normals of the faces that they lie on.
+    pub(super) fine: (Vec<Point3<f64>>, Vec<Vector3<f64>>),
     pub(super) voxel: f64,
 }
 
@@ -100,7 +102,8 @@ impl Surface {
         let points: Vec<_> = rows.iter().map(|&row| points[row]).collect();
         let normals: Vec<_> = rows.iter().map(|&row| normals[row]).collect();
         let thinned = voxel_downsample(&points, Some(&normals), voxel, interrupt)?;
-        Ok(Self { points: thinned.points, normals: thinned.normals.unwrap_or_default(), voxel })
+        let of_thinned = thinned.normals.unwrap_or_default();
+        Ok(Self { points: thinned.points, normals: of_thinned, fine: (points, normals), voxel })
     }
 }
 

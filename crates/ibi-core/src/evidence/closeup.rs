@@ -6,7 +6,7 @@ use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
 use super::noise::noise_of_rays;
 use super::odds::{BLURRED, Measures};
 use super::rays::{Rays, visible};
-use super::seen::{Look, Seen, Tally, Tolerance, merge, sight};
+use super::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
 use super::settle::{Steps, settle};
 use super::slip::{information, losses, moved, principal_motions, worth};
 use crate::detail::Detail;
@@ -20,6 +20,8 @@ use crate::scene::{Measurement, Scene};
 #[derive(Debug)]
 pub(crate) struct Closeup {
     rays: Vec<Rays>,
+    /// Whether points stand for what several eyes measured together.
+    is_fused: bool,
     rim: Rim,
     voxel: f64,
     noise: f64,
@@ -102,7 +104,7 @@ impl Closeup {
         let tolerance = Tolerance { aside: tolerance.aside.max(spacing), ..tolerance };
         let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
         let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);
-        Some(Self { rays, rim, voxel, noise, tolerance })
+        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, tolerance })
     }
 
     /// A pose settled, and what was measured of it.
@@ -220,5 +222,48 @@ fn information_of(scene: &Scene<'_>, pose: &Isometry3<f64>, at: &At) -> Option<(
 impl At {
     fn placed<'a>(&'a self, target_from_source: &'a Isometry3<f64>) -> Placed<'a> {
         Placed { target_from_source, points: &self.points, normals: &self.normals, sight: &self.sight }
+    }
+}
+
+/// What the last polish asks.
+impl Closeup {
+    /// Whether it is known what each eye measured: of a fused scan it is not known how far its points err alike.
+    pub(crate) fn is_fused(&self) -> bool {
+        self.is_fused
+    }
+
+    pub(super) fn rays(&self) -> &[Rays] {
+        &self.rays
+    }
+
+    pub(super) fn voxel(&self) -> f64 {
+        self.voxel
+    }
+
+    pub(super) fn noise(&self) -> f64 {
+        self.noise
+    }
+
+    pub(super) fn tolerance(&self) -> Tolerance {
+        self.tolerance
+    }
+
+    /// Where faces end that were measured, and the eyes see past them: points of the model, moved, and unit vectors across its rim,
+    /// outwards.
+    pub(super) fn ends(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Vec<(Point3<f64>, Vector3<f64>)> {
+        let at = self.at(scene, pose, 1);
+        let mut ends = Vec::new();
+        for (&row, offset) in self.rim.rows.iter().zip(&self.rim.offsets) {
+            let (row, offset) = (row as usize, pose.rotation * offset);
+            if at.sight[row].seen != Seen::Supported {
+                continue;
+            }
+            let place = at.points[row] + offset;
+            let past = self.rays.iter().map(|rays| look(rays, &place, &at.normals[row], self.tolerance).seen);
+            if past.max() == Some(Seen::Contradicted) {
+                ends.push((at.points[row], offset.normalize()));
+            }
+        }
+        ends
     }
 }

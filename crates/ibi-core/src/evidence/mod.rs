@@ -13,6 +13,8 @@
 //! | [`slip`] | how far do the data pin the pose down, and along which motions do they not? |
 //! | [`settle`] | is there a better pose close by, along those motions? |
 //! | [`noise`] | what is the unit of all that: how far do measured points lie off their surface? |
+//! | [`polish`] | at the end: where do all measured points that a pose explains want it to be? |
+//! | [`shared`] | how many of them err alike? |
 //!
 //! [`odds`] weighs them. [`rays`] holds what one eye measured, and [`explained`] tells which points of it are a pose's: what poses of
 //! different models compete for.
@@ -22,12 +24,15 @@ mod claims;
 mod closeup;
 pub mod contour;
 pub mod explained;
+mod fine;
 mod ledger;
 pub mod noise;
 pub mod odds;
+pub mod polish;
 pub mod rays;
 pub mod seen;
 pub mod settle;
+pub mod shared;
 pub mod slip;
 mod support;
 mod witnesses;
@@ -37,8 +42,11 @@ pub(crate) use claims::are_near;
 pub use claims::{Claims, NearClaims};
 pub(crate) use closeup::{Closeup, Proof};
 pub use contour::{Contour, Overrun};
+pub(crate) use fine::{Fine, Fitted, Known};
 pub(crate) use ledger::Ledger;
 pub use odds::{Measures, Objection};
 pub use seen::Tally;
+pub(crate) use shared::{Correlation, Pairs};
+pub use slip::FreeMotion;
 pub use support::Support;
 pub(crate) use witnesses::{LOOK_NEAR, Witnesses};

@@ -79,6 +79,18 @@ impl Rays {
         &self.eye
     }
 
+    /// All measured points, by row.
+    #[must_use]
+    pub fn all(&self) -> Vec<Point3<f64>> {
+        let of_side =
+            |side: &Side| side.rows.iter().copied().zip(side.ends.iter().copied()).collect::<Vec<_>>();
+        let mut all: Vec<(u32, Vector3<f64>)> = self.sides.iter().flat_map(of_side).collect();
+        all.sort_unstable_by_key(|&(row, _)| row);
+        // Those at the edge of a side are in both.
+        all.dedup_by_key(|&mut (row, _)| row);
+        all.into_iter().map(|(_, end)| self.eye + end).collect()
+    }
+
     /// The angle between neighbouring rays, radians: the median over rays of that to the nearest one.
     #[must_use]
     pub fn spacing(&self) -> f64 {

@@ -45,12 +45,18 @@ pub fn information(
 ) -> Matrix6<f64> {
     let mut sum = Matrix6::zeros();
     for (p, n) in points.iter().zip(normals) {
-        let turn = (p - centre).cross(n);
-        let j = Vector6::new(turn.x, turn.y, turn.z, n.x, n.y, n.z);
+        let j = jacobian(p, n, centre);
         sum.syger(1.0, &j, &j, 1.0);
     }
     sum.fill_upper_triangle_with_lower_triangle();
     sum / (noise * noise)
+}
+
+/// By how much a small motion about `centre` moves a point along a unit vector: ((p - c) x n, n).
+#[must_use]
+pub fn jacobian(point: &Point3<f64>, along: &Vector3<f64>, centre: &Point3<f64>) -> Vector6<f64> {
+    let turn = (point - centre).cross(along);
+    Vector6::new(turn.x, turn.y, turn.z, along.x, along.y, along.z)
 }
 
 /// The covariance of a pose of which measured points give this `information`: its inverse, the motion of a part of a `size` (data
@@ -88,6 +94,7 @@ pub fn principal_motions(information: &Matrix6<f64>, size: f64) -> [(Vector6<f64
 
 /// A motion that costs nothing.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize), serde(rename_all = "snake_case"))]
 pub enum FreeMotion {
     /// A slide along a unit vector.
     Slide {

@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 
 use nalgebra::Isometry3;
 
-use crate::evidence::Proof;
+use crate::evidence::{Known, Proof};
 use crate::scene::Scene;
 use crate::stages::Hypothesis;
 
@@ -15,6 +15,8 @@ pub(crate) struct Instance {
     pub(crate) round: u32,
     /// What a close look has found, if there was one.
     pub(crate) proof: Option<Proof>,
+    /// How well it is known, once it has had its last polish.
+    pub(crate) known: Option<Known>,
     overlap: OnceLock<f64>,
 }
 
@@ -44,7 +46,17 @@ pub(crate) struct Instances {
 impl Instances {
     pub(crate) fn push(&mut self, hypothesis: Hypothesis, round: u32, proof: Option<Proof>) {
         self.poses.push(hypothesis.target_from_source);
-        self.all.push(Instance { hypothesis, round, proof, overlap: OnceLock::new() });
+        self.all.push(Instance { hypothesis, round, proof, known: None, overlap: OnceLock::new() });
+    }
+
+    /// The last polish of one of them.
+    pub(crate) fn polished(&mut self, at: usize, target_from_source: Isometry3<f64>, known: Known) {
+        let instance = &mut self.all[at];
+        if instance.hypothesis.target_from_source != target_from_source {
+            instance.overlap = OnceLock::new();
+        }
+        (instance.hypothesis.target_from_source, instance.known) = (target_from_source, Some(known));
+        self.poses[at] = target_from_source;
     }
 
     pub(crate) fn poses(&self) -> &[Isometry3<f64>] {

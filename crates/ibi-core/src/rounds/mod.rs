@@ -9,6 +9,7 @@
 //! | `closely` | looks at a pose on all that was measured before it becomes an instance |
 //! | `turns` | tries a pose the other ways round before it becomes an instance |
 //! | `joint` | at the end all poses compete for the scene at once |
+//! | `lastly` | the last polish on all that was measured |
 //! | `ranking` | makes the result |
 //!
 //! The shortcuts save time and can be left out one by one ([`Shortcuts`]):
@@ -27,6 +28,7 @@ mod glance;
 mod instances;
 mod joint;
 mod judge;
+mod lastly;
 mod memory;
 mod problem;
 mod ranking;

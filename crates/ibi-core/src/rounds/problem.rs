@@ -96,6 +96,11 @@ impl<'a> Problem<'a> {
         barred
     }
 
+    /// All that was measured, if that is more than the clouds.
+    pub(crate) fn closeup(&self) -> Option<&Closeup> {
+        self.closeup.as_ref()
+    }
+
     /// Whether there is more to look at than the clouds.
     pub(crate) fn has_closeup(&self) -> bool {
         self.closeup.is_some()

@@ -81,6 +81,9 @@ fn measure(problem: &Problem<'_>, instance: &Instance, support: &Support) -> (Po
         inliers,
         round: instance.round,
         measures: instance.proof.map(|proof| proof.measures),
+        centre: pose * scene.source.centre,
+        covariance: instance.known.as_ref().map(|known| known.covariance),
+        free_motions: instance.known.as_ref().map(|known| known.free_motions.clone()).unwrap_or_default(),
     };
     (pose, residuals_sq)
 }

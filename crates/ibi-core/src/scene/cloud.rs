@@ -28,6 +28,7 @@ pub struct Cloud<'a> {
     pub(crate) measured: Measurement<'a>,
     pub(crate) frames: Option<Vec<Matrix3<f64>>>,
     pub(crate) symmetries: Symmetries,
+    pub(crate) fine: Option<(Vec<Point3<f64>>, Vec<Vector3<f64>>)>,
 }
 
 impl<'a> Cloud<'a> {
@@ -48,6 +49,14 @@ impl<'a> Cloud<'a> {
     #[must_use]
     pub fn with_frames(mut self, frames: Vec<Matrix3<f64>>) -> Self {
         self.frames = Some(frames);
+        self
+    }
+
+    /// More points of the surface that a source's are of, closer to each other, with the normals of the faces that they lie on:
+    /// what poses are polished on at the end. By default the cloud itself.
+    #[must_use]
+    pub fn with_fine(mut self, points: Vec<Point3<f64>>, normals: Vec<Vector3<f64>>) -> Self {
+        self.fine = Some((points, normals));
         self
     }
 
@@ -145,6 +154,8 @@ pub struct PreparedCloud<'a> {
     pub frames: Option<Vec<Matrix3<f64>>>,
     /// Where the depth cameras stood.
     pub viewpoints: Vec<Point3<f64>>,
+    /// More points of its surface, and their unit normals.
+    pub fine: Option<(Vec<Point3<f64>>, Vec<Vector3<f64>>)>,
     /// What leaves the cloud looking the same, if that was declared.
     pub symmetries: Symmetries,
     /// Mean distance of a point to its nearest distinct other point, in data units; stray points do not count.
@@ -212,6 +223,12 @@ impl<'a> PreparedCloud<'a> {
             .as_deref()
             .map(|rows| normalised(rows, normals, points.len(), argument))
             .transpose()?;
+        let fine = cloud.fine.as_ref().filter(|(points, _)| !points.is_empty());
+        let fine = fine.map(|(points, rows)| {
+            check_points(points, argument)?;
+            Ok::<_, Error>((points.clone(), normalised(rows, normals, points.len(), argument)?))
+        });
+        let fine = fine.transpose()?;
         if let Some(rows) = &cloud.frames {
             check_frames(rows, frames, points.len(), argument)?;
         }
@@ -237,6 +254,7 @@ impl<'a> PreparedCloud<'a> {
             points: points.clone(),
             frames: cloud.frames.clone(),
             viewpoints: cloud.viewpoints.clone(),
+            fine,
             symmetries: cloud.symmetries.clone(),
             spacing,
             extent,

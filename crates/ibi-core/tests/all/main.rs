@@ -34,6 +34,7 @@ mod nnsr;
 mod oriented;
 #[cfg(feature = "serde")]
 mod params;
+mod polish;
 mod refinement;
 mod scans;
 mod sight;
