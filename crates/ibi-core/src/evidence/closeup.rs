@@ -97,7 +97,7 @@ impl Closeup {
         let voxel = VOXELS_PER_SPACING * scene.resolution;
         // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
         let noise = noise_of_rays(&rays[0], &scene.target.points);
-        if noise >= BLURRED * voxel && rays.len() == 1 {
+        if noise >= BLURRED * voxel && of_all.is_none() {
             return None;
         }
         let tolerance = Tolerance::of(voxel, noise);
@@ -155,7 +155,7 @@ impl Closeup {
                 overrun,
                 losses: losses_of,
                 noise: noise / voxel,
-                num_eyes: self.rays.len() as u32,
+                is_fused: self.is_fused,
                 ..Measures::default()
             },
         }

@@ -276,7 +276,7 @@ impl<'a> Sighted<'a> {
             (eye, view.own.map_or(&[][..], |own| own.from(&eye.place, target_from_source)))
         };
         let eyes =
-            asked(&places, &(target_from_source * middle)).into_iter().take(1).map(with_shadow).collect();
+            asked(&places, &(target_from_source * middle));
         Self { eyes, normals, tolerance }
     }
 
