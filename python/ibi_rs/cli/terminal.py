@@ -80,6 +80,8 @@ class _Command(TyperCommand):
                 split.append(argument)
                 continue
             numbers = [number for number in argument.replace(",", " ").split() if number]
+            if len(numbers) > wanted:
+                misused(f"{argument}: too many numbers")
             split, wanted = split + numbers, max(0, wanted - len(numbers))
         return super().parse_args(ctx, split)
 
