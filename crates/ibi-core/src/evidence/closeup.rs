@@ -13,7 +13,7 @@ use crate::detail::Detail;
 use crate::interrupt::Interrupt;
 use crate::kernels::nearby::spacing_until;
 use crate::kernels::par;
-use crate::kernels::sight::asked;
+use crate::kernels::sight::{FEW_EYES, asked};
 use crate::scene::{Measurement, Scene};
 
 /// What one eye or several have measured in all, and where the source's faces end.
@@ -181,7 +181,10 @@ impl Closeup {
     /// Of the eyes that know most of what lies around a pose.
     fn asked(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Vec<&Rays> {
         let places: Vec<Point3<f64>> = self.rays.iter().map(|rays| *rays.eye()).collect();
-        asked(&places, &(pose * scene.source.centre)).into_iter().map(|row| &self.rays[row]).collect()
+        asked(&places, &(pose * scene.source.centre), FEW_EYES)
+            .into_iter()
+            .map(|row| &self.rays[row])
+            .collect()
     }
 
     fn scan<'s>(scene: &'s Scene<'_>) -> Option<Scan<'s>> {

@@ -275,8 +275,9 @@ impl<'a> Sighted<'a> {
             let eye = &view.eyes[row];
             (eye, view.own.map_or(&[][..], |own| own.from(&eye.place, target_from_source)))
         };
-        let eyes =
-            asked(&places, &(target_from_source * middle));
+        // Of a camera that went about the nearest place sees enough to tell poses from each other.
+        let asked = asked(&places, &(target_from_source * middle), 1);
+        let eyes = asked.into_iter().map(with_shadow).collect();
         Self { eyes, normals, tolerance }
     }
 
