@@ -170,7 +170,7 @@ impl Fine {
         let (measured, touches): (Vec<Measured>, Vec<Touch>) =
             measured.into_iter().zip(touches).filter_map(|(ray, touch)| Some((ray, touch?))).unzip();
         let places: Vec<Point3<f64>> = measured.iter().map(|ray| ray.at).collect();
-        let is_same_side = self.sides(scene, &places, &touches);
+        let is_same_side = sides(scene, &places, &touches);
         let own = self.distances(&places, pose);
         let mut is_own = is_same_side;
         for other in others {
@@ -179,17 +179,6 @@ impl Fine {
             }
         }
         measured.into_iter().zip(is_own).filter_map(|(ray, is_own)| is_own.then_some(ray)).collect()
-    }
-
-    /// Whether the thinned scan has a point near each place, turned to the side of what it touches.
-    fn sides(&self, scene: &Scene<'_>, places: &[Point3<f64>], touches: &[Touch]) -> Vec<bool> {
-        let Some(normals) = &scene.target.normals else { return vec![true; places.len()] };
-        let reach = scene.near_target.reach().min(2.0 * scene.resolution);
-        let nearest = scene.near_target.nearest_each(reach, places);
-        let is_same = |(row, touch): (Option<u32>, &Touch)| {
-            row.is_some_and(|row| normals[row as usize].dot(&touch.normal) > SAME_SIDE_COS)
-        };
-        nearest.into_iter().zip(touches).map(is_same).collect()
     }
 
     /// Of places from the nearest point of the model that a pose has moved; infinite if it is far.
@@ -220,6 +209,17 @@ impl Fitted {
             free_motions: free_motions(&information, &self.centre, self.size, self.tolerance),
         }
     }
+}
+
+/// Whether the thinned scan has a point near each place, turned to the side of what it touches.
+fn sides(scene: &Scene<'_>, places: &[Point3<f64>], touches: &[Touch]) -> Vec<bool> {
+    let Some(normals) = &scene.target.normals else { return vec![true; places.len()] };
+    let reach = scene.near_target.reach().min(2.0 * scene.resolution);
+    let nearest = scene.near_target.nearest_each(reach, places);
+    let is_same = |(row, touch): (Option<u32>, &Touch)| {
+        row.is_some_and(|row| normals[row as usize].dot(&touch.normal) > SAME_SIDE_COS)
+    };
+    nearest.into_iter().zip(touches).map(is_same).collect()
 }
 
 /// The information of the ends of faces that the eyes see past.

@@ -100,7 +100,8 @@ impl Pairs {
     /// Of how many points the errors are one, on average, where they are correlated so: 1 where each has its own.
     #[must_use]
     pub fn sharing(&self, correlation: &Correlation) -> f64 {
-        let shared = |k: usize| correlation.at(k as f64 + 0.5) * self.cosines[k];
+        let lag = |k: usize| if self.nums[k] > 0.0 { self.lags[k] / self.nums[k] } else { k as f64 + 0.5 };
+        let shared = |k: usize| correlation.at(lag(k)) * self.cosines[k];
         (1.0 + (0..LAGS).map(shared).sum::<f64>() / self.num.max(1.0)).max(1.0)
     }
 }

@@ -19,6 +19,9 @@ use crate::kernels::rng::Rng;
 use crate::kernels::sight::OwnShadow;
 use crate::symmetries::Symmetries;
 
+/// As many normals as points.
+pub(crate) type PointsAndNormals = (Vec<Point3<f64>>, Vec<Vector3<f64>>);
+
 /// A point cloud as a user hands it in: nothing is checked until a [`crate::Registrar`] takes it.
 #[derive(Debug, Clone, Default)]
 pub struct Cloud<'a> {
@@ -28,7 +31,7 @@ pub struct Cloud<'a> {
     pub(crate) measured: Measurement<'a>,
     pub(crate) frames: Option<Vec<Matrix3<f64>>>,
     pub(crate) symmetries: Symmetries,
-    pub(crate) fine: Option<(Vec<Point3<f64>>, Vec<Vector3<f64>>)>,
+    pub(crate) fine: Option<PointsAndNormals>,
 }
 
 impl<'a> Cloud<'a> {
@@ -155,7 +158,7 @@ pub struct PreparedCloud<'a> {
     /// Where the depth cameras stood.
     pub viewpoints: Vec<Point3<f64>>,
     /// More points of its surface, and their unit normals.
-    pub fine: Option<(Vec<Point3<f64>>, Vec<Vector3<f64>>)>,
+    pub fine: Option<PointsAndNormals>,
     /// What leaves the cloud looking the same, if that was declared.
     pub symmetries: Symmetries,
     /// Mean distance of a point to its nearest distinct other point, in data units; stray points do not count.
