@@ -211,7 +211,7 @@ impl Params {
     /// [`Self::single_view`], with more patience: large scenes hold much that looks like a part.
     #[must_use]
     pub fn many_views() -> Self {
-        Self { max_rejections: Some(2000), ..Self::single_view() }
+        Self { max_rejections: Some(4000), ..Self::single_view() }
     }
 
     /// When points agree.

@@ -60,7 +60,11 @@ fn every_instance_is_found_in_a_scene_seen_from_all_sides() {
     assert_eq!(found.registration.poses.len(), 3);
     assert_eq!(num_right(&found, &part, &truth), 3);
     assert_eq!(found.doubts().count(), 0);
-    assert_eq!(found.params, Params::default());
+    assert_eq!(found.params, Params::many_views());
+    assert!(
+        found.registration.poses.iter().all(|pose| pose.measures.is_some()),
+        "looked at from places that see it"
+    );
 }
 
 #[test]

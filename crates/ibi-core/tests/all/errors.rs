@@ -371,8 +371,13 @@ fn parameters_must_be_in_range() {
         let error = Error::Param { name, value, allowed };
         assert_fails(&input, &error, &format!("params.{name} is {value}; it must be {allowed}"));
     }
-    for preset in [Params::default(), Params::paper_synthetic(), Params::paper_real(), Params::single_view()]
-    {
+    for preset in [
+        Params::default(),
+        Params::paper_synthetic(),
+        Params::paper_real(),
+        Params::single_view(),
+        Params::many_views(),
+    ] {
         assert_eq!(preset.validate(), Ok(()));
     }
 }

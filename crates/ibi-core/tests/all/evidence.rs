@@ -1,12 +1,11 @@
 //! What speaks for a pose: the support of its correspondences against chance, and how closely the clouds fit.
 
-use crate::oriented::{Oriented, clouds};
+use crate::oriented::{Oriented, clouds, seen_from};
 use ibi_core::Support;
 use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, chance_fit, fit, overlap, places};
 use ibi_core::kernels::par::Pool;
 use ibi_core::kernels::rng::Rng;
-use ibi_core::kernels::sight::View;
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_testkit::naive;
 use ibi_testkit::strategies::{point, rigid_motions};
@@ -199,7 +198,7 @@ proptest! {
         let target = source.moved(&pose).joined(30, &others);
         let (back, forth) = (source.flipped(&one), target.flipped(&other));
         let near = Nearby::new(&target.points, 1.0);
-        let unoriented = Contact { view: viewpoint.map(View::from), ..contact(1.0, false) };
+        let unoriented = Contact { view: viewpoint.map(seen_from), ..contact(1.0, false) };
         let ask = |source: &Oriented, target: &Oriented, contact: &Contact| {
             let (from, to) = (source.surface(true), target.surface(true));
             (
@@ -248,13 +247,13 @@ fn fit_looks_at_what_the_viewpoint_sees() {
         normals: vec![Vector3::z(), -Vector3::z(), Vector3::z()],
     };
     let target = Oriented { points: vec![Point3::origin()], normals: vec![Vector3::z()] };
-    let seen_from = |z: f64, oriented| {
-        let contact = Contact { view: Some(View::from(Point3::new(0.0, 0.0, z))), ..contact(1.0, oriented) };
+    let fit_from = |z: f64, oriented| {
+        let contact = Contact { view: Some(seen_from(Point3::new(0.0, 0.0, z))), ..contact(1.0, oriented) };
         fit_of(&source, &target, &Isometry3::identity(), &contact, None, true)
     };
     // From above two of three are seen and one of them fits; from below the other one only.
-    assert_eq!((seen_from(99.0, true), seen_from(-99.0, true)), (0.5, 0.0));
-    assert_eq!((seen_from(99.0, false), seen_from(-99.0, false)), (1.0 / 3.0, 1.0 / 3.0));
+    assert_eq!((fit_from(99.0, true), fit_from(-99.0, true)), (0.5, 0.0));
+    assert_eq!((fit_from(99.0, false), fit_from(-99.0, false)), (1.0 / 3.0, 1.0 / 3.0));
 }
 
 // -------------------------------------------------------------------------------------------------- chance fit
@@ -283,7 +282,7 @@ fn chance_fit_is_its_twin_and_the_same_for_any_number_of_threads() {
     let near = Nearby::new(&target.points, 1.5);
     for (reach, oriented) in [(0.5, true), (0.5, false), (1.5, true)] {
         // A viewpoint says nothing about a pose that is not known.
-        let contact = Contact { view: Some(View::from(Point3::origin())), ..contact(reach, oriented) };
+        let contact = Contact { view: Some(seen_from(Point3::origin())), ..contact(reach, oriented) };
         let ask = |samples| {
             let rng = Rng::new(3, 0, 3);
             chance_fit(&source.surface(true), &target.surface(true), &near, &contact, rng, samples)

@@ -389,7 +389,7 @@ impl Model {
     /// With rays, and without.
     fn contours(&self, pose: &Isometry3<f64>, seeing: &Seeing) -> [Contour; 2] {
         let posed = self.posed(pose, seeing);
-        [Some(&seeing.rays), None]
+        [&[&seeing.rays][..], &[]]
             .map(|rays| contour(&self.rim, seeing.scan(), rays, posed.placed(), TOLERANCE, STEP))
     }
 
@@ -402,7 +402,7 @@ impl Model {
     /// As a verdict would have it.
     fn worth(&self, pose: &Isometry3<f64>, seeing: &Seeing) -> f64 {
         let posed = self.posed(pose, seeing);
-        let run_on = run_on(&self.rim, &seeing.rays, posed.placed(), TOLERANCE);
+        let run_on = run_on(&self.rim, &[&seeing.rays], posed.placed(), TOLERANCE);
         let can_be_seen = |row: &&u32| posed.sight[**row as usize].seen != Seen::Away;
         let num_ends = self.rim.rows.iter().filter(can_be_seen).count() as u32;
         worth(&posed.sight, run_on, num_ends, TOLERANCE.across)
@@ -427,7 +427,7 @@ fn a_face_that_ends_where_the_part_does_is_told_from_one_that_runs_on() {
     for contour in model.contours(&pose, &seeing) {
         assert!(contour.runs_on == 0 && contour.ends > 50, "{contour:?}");
     }
-    assert!(run_on(&model.rim, &seeing.rays, model.posed(&pose, &seeing).placed(), TOLERANCE) < 1e-12);
+    assert!(run_on(&model.rim, &[&seeing.rays], model.posed(&pose, &seeing).placed(), TOLERANCE) < 1e-12);
     let Overrun { beyond, on } = model.overrun(&pose, &seeing);
     assert!(beyond == 0 && on > 500, "{beyond} of {on}");
     // On the wall all sides run on.
@@ -435,7 +435,7 @@ fn a_face_that_ends_where_the_part_does_is_told_from_one_that_runs_on() {
     for contour in model.contours(&on_wall, &seeing) {
         assert!(contour.ends == 0 && contour.runs_on > 50, "{contour:?}");
     }
-    let run_on = run_on(&model.rim, &seeing.rays, model.posed(&on_wall, &seeing).placed(), TOLERANCE);
+    let run_on = run_on(&model.rim, &[&seeing.rays], model.posed(&on_wall, &seeing).placed(), TOLERANCE);
     let [of_rays, _] = model.contours(&on_wall, &seeing);
     assert!((run_on - f64::from(of_rays.runs_on)).abs() < 1e-9, "all rays end there");
     let Overrun { beyond, on } = model.overrun(&on_wall, &seeing);
@@ -698,6 +698,7 @@ fn what_speaks_for_a_pose_raises_its_odds() {
         overrun: Overrun { beyond: 2, on: 250 },
         losses: [0.1, 0.2, 0.3],
         noise: 0.05,
+        is_fused: false,
         closeness: 0.9,
         evidence: 3.0,
     };
@@ -710,6 +711,8 @@ fn what_speaks_for_a_pose_raises_its_odds() {
     ];
     for worse in bad {
         assert!(worse.log_odds() < good.log_odds(), "{worse:?}");
+        let [worse, good] = [worse, good].map(|one| Measures { is_fused: true, ..one });
+        assert!(worse.log_odds() < good.log_odds(), "fused {worse:?}");
     }
     // The unknown speaks neither way.
     let hidden = Measures { tally: Tally { hidden: 500, unknown: 99, away: 400, ..good.tally }, ..good };

@@ -1,11 +1,17 @@
-//! Clouds with normals.
+//! Clouds with normals, and cameras that see them.
 
 use ibi_core::kernels::overlap::Surface;
+use ibi_core::kernels::sight::{Eye, View};
 use ibi_core::nalgebra::{Isometry3, Point3, Vector3};
 use ibi_testkit::naive;
 use ibi_testkit::scenes::asymmetric_model;
 use ibi_testkit::strategies::{point, rigid_motions};
 use proptest::prelude::*;
+
+/// What a camera sees of which nothing is known but its place.
+pub(crate) fn seen_from(place: Point3<f64>) -> View<'static> {
+    View { eyes: Vec::leak(vec![Eye::at(place)]), own: None }
+}
 
 /// A cloud with normals.
 #[derive(Debug, Clone, Default)]

@@ -2,12 +2,11 @@
 //! who may claim a scene point.
 
 use crate::mock::Mock;
-use crate::oriented::{Oriented, clouds};
+use crate::oriented::{Oriented, clouds, seen_from};
 use ibi_core::kernels::icp::{Stop, icp};
 use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, MIN_FACING_COS, Place, Surface, overlap, overlap_of, places};
 use ibi_core::kernels::par::Pool;
-use ibi_core::kernels::sight::View;
 use ibi_core::nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use ibi_core::stages::hv::{Hv, Overlap};
 use ibi_core::stages::scs::LocalGtm;
@@ -25,7 +24,7 @@ fn contact(distance: f64, viewpoint: Option<Point3<f64>>) -> Contact<'static> {
         distance,
         min_normal_cos: 0.5,
         oriented: true,
-        view: viewpoint.map(View::from),
+        view: viewpoint.map(seen_from),
         to_planes: false,
     }
 }
@@ -50,7 +49,8 @@ fn check_place(
 ) {
     let facing = match contact.view {
         Some(view) if oriented => {
-            normal.dot(&(view.eye - point)) - MIN_FACING_COS * (view.eye - point).norm()
+            let to_eye = view.eyes[0].place - point;
+            normal.dot(&to_eye) - MIN_FACING_COS * to_eye.norm()
         }
         _ => f64::INFINITY,
     };

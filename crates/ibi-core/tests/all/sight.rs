@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use ibi_core::kernels::nearby::Nearby;
 use ibi_core::kernels::overlap::{Contact, Place, Surface, fit, overlap_of, own_fit, places, visible};
 use ibi_core::kernels::rng::Rng;
-use ibi_core::kernels::sight::{OwnShadow, RangeImage, Sight, View};
+use ibi_core::kernels::sight::{Eye, OwnShadow, RangeImage, Sight, View};
 use ibi_core::nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ibi_core::stages::hv::{Evidence, Hv};
 use ibi_core::stages::{Context, Estimate, EstimatePose, Hypothesis, Ranked};
@@ -133,20 +133,20 @@ struct Scene {
     source_normals: Vec<Vector3<f64>>,
     wall: Vec<Point3<f64>>,
     wall_normals: Vec<Vector3<f64>>,
-    image: RangeImage,
+    eyes: [Eye; 1],
 }
 
 impl Scene {
     fn new() -> Self {
         let source = sheet([-0.5, 0.5], [-0.5, 0.5], 0.0, 0.1);
         let wall = sheet([-4.0, 4.0], [-4.0, 4.0], 4.0, 0.04);
-        let image = RangeImage::new(Point3::origin(), &wall, 0.02).unwrap();
+        let measured = RangeImage::new(Point3::origin(), &wall, 0.02);
         Self {
             source_normals: vec![-Vector3::z(); source.len()],
             wall_normals: vec![-Vector3::z(); wall.len()],
             source,
             wall,
-            image,
+            eyes: [Eye { place: Point3::origin(), measured }],
         }
     }
 
@@ -159,9 +159,44 @@ impl Scene {
     }
 
     fn contact(&self) -> Contact<'_> {
-        let view = Some(View { eye: Point3::origin(), own: None, measured: Some(&self.image) });
+        let view = Some(View { eyes: &self.eyes, own: None });
         Contact { distance: 0.1, min_normal_cos: 0.5, oriented: true, view, to_planes: true }
     }
+}
+
+#[test]
+fn what_one_of_several_cameras_sees_is_seen() {
+    let scene = Scene::new();
+    let near = Nearby::new(&scene.wall, 0.1);
+    let behind = || Eye::at(Point3::new(0.0, 0.0, 9.0));
+    let blocked = || {
+        let sheet = sheet([-4.0, 4.0], [-4.0, 4.0], 1.0, 0.04);
+        let place = Point3::new(0.3, 0.0, 0.0);
+        Eye { place, measured: RangeImage::new(place, &sheet, 0.02) }
+    };
+    let front =
+        || Eye { place: Point3::origin(), measured: RangeImage::new(Point3::origin(), &scene.wall, 0.02) };
+    let num_of = |eyes: &[Eye], z: f64, wanted: fn(&Place) -> bool| {
+        let contact = Contact { view: Some(View { eyes, own: None }), ..scene.contact() };
+        let pose = Isometry3::translation(0.0, 0.0, z);
+        places(&scene.source(), &scene.wall(), &near, &pose, &contact).iter().filter(|p| wanted(p)).count()
+    };
+    let all = scene.source.len();
+    let is_hidden: fn(&Place) -> bool = |place| *place == Place::Hidden;
+    // On the wall: from behind it faces away, and something is in the way of the other.
+    assert_eq!(num_of(&[behind()], 4.0, is_hidden), all);
+    assert_eq!(num_of(&[blocked()], 4.0, is_hidden), all);
+    assert_eq!(num_of(&[behind(), blocked()], 4.0, is_hidden), all);
+    for eyes in [[front(), blocked()], [blocked(), front()], [behind(), front()]] {
+        assert_eq!(num_of(&eyes, 4.0, |place| matches!(place, Place::On(_))), all);
+        // In the open one looks through it, and nobody sees it.
+        assert_eq!(num_of(&eyes, 2.0, |place| *place == Place::Through), all);
+    }
+    // Of many the nearest is asked.
+    let far = |x: f64| Eye::at(Point3::new(x, 0.0, -50.0));
+    let many = [far(0.0), far(1.0), behind(), far(2.0), far(3.0)];
+    assert_eq!(num_of(&many, 4.0, is_hidden), all);
+    assert_eq!(num_of(&many[..4], 4.0, is_hidden), 0);
 }
 
 #[test]
