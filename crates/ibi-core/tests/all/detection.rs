@@ -341,8 +341,11 @@ fn named(parts: &[(&str, &Arc<Model>)]) -> Models {
     Models::new(parts.iter().map(|&(name, model)| (name.to_owned(), Arc::clone(model))).collect()).unwrap()
 }
 
-/// A lopsided box twice and a tee once, far apart, as a camera sees them; and where they are.
-fn mixed() -> ([Arc<Model>; 2], [Vec<Isometry3<f64>>; 2], Vec<Point3<f64>>, Point3<f64>) {
+/// Two parts, where each is, what a camera sees of them, and where it is.
+type Mixed = ([Arc<Model>; 2], [Vec<Isometry3<f64>>; 2], Vec<Point3<f64>>, Point3<f64>);
+
+/// A lopsided box twice and a tee once, far apart.
+fn mixed() -> Mixed {
     let parts = [shapes::lopsided(), shapes::tee()].map(|solid| Arc::new(model(&solid)));
     let places = placed(3, 5.0, 3);
     let truth = [places[..2].to_vec(), places[2..].to_vec()];
@@ -447,12 +450,12 @@ fn only_a_region_is_looked_into() {
     let scan = || Cloud::new(&points).with_viewpoint(eye);
     let middle = truth[0][1] * Point3::origin();
     let reach = Vector3::repeat(2.2);
-    let roi = Some(Roi::between(middle - reach, middle + reach));
-    let found = parts[0].detect(&scan(), &Detect { roi, ..Detect::default() }).unwrap();
+    let roi = Roi::between(middle - reach, middle + reach);
+    let found = parts[0].detect(&scan(), &Detect { roi: Some(roi), ..Detect::default() }).unwrap();
     assert_eq!(num_right(&found, &parts[0], &truth[0][1..]), 1);
     assert_eq!(found.registration.poses.len(), 1);
     // As if the rest had been cut off, and were still known to have been measured.
-    let inside: Vec<_> = points.iter().copied().filter(|p| roi.unwrap().contains(p)).collect();
+    let inside: Vec<_> = points.iter().copied().filter(|p| roi.contains(p)).collect();
     let cut = Cloud::new(&inside).with_viewpoint(eye).with_measured(&points[..]);
     let cut = parts[0].detect(&cut, &Detect::default()).unwrap();
     assert_eq!(found.registration.poses[0].measures, cut.registration.poses[0].measures);

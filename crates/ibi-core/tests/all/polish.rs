@@ -227,7 +227,7 @@ fn sums_over_pairs_are_those_of_each_with_each_other() {
             }
         }
     }
-    for k in 0..LAGS {
-        assert!((found.products[k] - expected[k]).abs() < 1e-9);
+    for (product, expected) in found.products.iter().zip(expected) {
+        assert!((product - expected).abs() < 1e-9);
     }
 }
