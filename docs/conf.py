@@ -38,6 +38,7 @@ PRESETS = {
     "paper_synthetic": ibi_rs.Params.paper_synthetic(),
     "paper_real": ibi_rs.Params.paper_real(),
     "single_view": ibi_rs.Params.single_view(),
+    "many_views": ibi_rs.Params.many_views(),
 }
 
 

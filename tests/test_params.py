@@ -57,6 +57,7 @@ SETTINGS = {
     "paper_synthetic": ibi.Params.paper_synthetic(),
     "paper_real": ibi.Params.paper_real(),
     "single_view": ibi.Params.single_view(),
+    "many_views": ibi.Params.many_views(),
 }
 each_setting = pytest.mark.parametrize("params", SETTINGS.values(), ids=SETTINGS)
 
@@ -64,7 +65,7 @@ each_setting = pytest.mark.parametrize("params", SETTINGS.values(), ids=SETTINGS
 # Defaults ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["default", "paper_synthetic", "paper_real", "single_view"])
+@pytest.mark.parametrize("name", ["default", "paper_synthetic", "paper_real", "single_view", "many_views"])
 def test_presets_are_those_of_the_core(name):
     assert SETTINGS[name].to_dict() == json.loads(_core.preset(name))
 

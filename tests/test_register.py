@@ -84,7 +84,8 @@ def test_a_pose_is_typed_throughout(found):
         assert found.rounds[pose.round].accepted
     assert {field.name for field in fields(ibi.Pose)} == {
         *MEASURES,
-        *("target_from_source", "inliers", "round", "measures"),
+        *("target_from_source", "inliers", "round", "measures", "model", "model_name"),
+        *("centre", "covariance", "free_motions"),
     }
 
 

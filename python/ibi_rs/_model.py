@@ -306,9 +306,9 @@ class Model:
             finite gets that of its nearest point; where most are, they are refused.
         viewpoint : (3,) or (E, 3) array_like, View or sequence of View
             Where the depth camera stood, in the frame of ``tgt``: ``[0, 0, 0]`` for most scans. Where ``tgt``
-            is not all that it measured, a :class:`View` of all. Of several cameras, or one that went about, the
-            places of all, or a View of each; what one of them sees was seen. It may be left out where normals
-            are given: then it is guessed from where the surfaces were seen.
+            is not all that it measured, a :class:`View` of all. Of several cameras, or of one that moved,
+            the places of all, or a View of each; what one of them sees was seen. It may be left out where
+            normals are given: then places from which one could see the scene stand for the cameras.
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
             less than 2 % of the points lie behind it, as the viewpoint sees it.

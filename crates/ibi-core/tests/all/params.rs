@@ -18,8 +18,14 @@ fn options() -> Vec<(&'static str, Value)> {
     ]
 }
 
-fn presets() -> [Params; 4] {
-    [Params::default(), Params::paper_synthetic(), Params::paper_real(), Params::single_view()]
+fn presets() -> [Params; 5] {
+    [
+        Params::default(),
+        Params::paper_synthetic(),
+        Params::paper_real(),
+        Params::single_view(),
+        Params::many_views(),
+    ]
 }
 
 fn to_json(params: &Params) -> Value {
