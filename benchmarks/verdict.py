@@ -33,7 +33,7 @@ from frame.tables import show
 from frame.timing import timed
 from verdict_metrics import HIDDEN, RIGHT, UNKNOWN, WRONG, Judgement, brier, calibration_error
 from verdict_pictures import draw
-from verdict_searches import GAPS, KINDS, ROWS, SIZES, TAKES_EYES, Models, Search, outlier_scenes
+from verdict_searches import GAPS, KINDS, ROWS, SIZES, Models, Search, outlier_scenes
 
 PAGE = records.DOCS / "verdict.md"
 PICTURE = "verdict_reliability.png"
@@ -44,8 +44,8 @@ RECORDS = {
 """Searches and poses of each column of the page; before: as it was when this was first measured."""
 OUTLIERS = "outliers"
 LOW_SCORE = 0.02
-NO_LOW = ("absent", "mirror", "sizes", *(() if TAKES_EYES else ("rooms, eyes",)))
-"""Regimes in which only poses that are returned count; with one eye of many low scores mean nothing."""
+NO_LOW = ("absent", "mirror", "sizes")
+"""Regimes in which only poses that are returned count."""
 RETURNED, LOW = "returned", "low"
 COLUMNS = (
     *("half", "regime", "what", "scan", "part", "scale", "run", "points", "visible", "poses"),

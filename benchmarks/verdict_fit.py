@@ -1,11 +1,11 @@
-"""Fit the weights of a close look (`SHARP` of odds.rs in the core) on the tuning half of verdict.py.
+"""Fit the weights of a close look, `SHARP` and `FUSED` of odds.rs, to the tuning half of verdict.py.
 
 IBI_DATA=... python benchmarks/verdict_fit.py
 
 Each search gives the poses on which it was decided: those returned and those rejected. Right are those that
 are one to one with a truth. Others near the same truth are left out, and so are poses that are nearly right,
-and models of nearly the right size: neither answer would be wrong. Where a scan is blurred other weights
-hold, which are not fitted here.
+and models of nearly the right size: neither answer would be wrong. Where a scan of one camera is
+blurred other weights hold, which are not fitted here; scans that were fused from many views have their own.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", 
 SHARP = 0.12
 """As in odds.rs: the noise up to which a scan is sharp, voxels."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
-REGIMES = ("boxes", "scans", "bins", "rows", "mirror", "sizes", "absent")
+REGIMES = ("boxes", "scans", "bins", "rows", "rooms", "mirror", "sizes", "absent")
 POWER = 0.7
 """A class of n poses in a regime weighs n to 1 minus this."""
 
@@ -43,6 +43,11 @@ def terms(of: ibi.Measures) -> list[float]:
     ]
 
 
+def is_fused(search: Search) -> bool:
+    """Return whether a scan was fused from many views: those come with normals."""
+    return "tgt_normals" in search.scan.told
+
+
 def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]]:
     """Search, and return the terms of each pose with whether it is right."""
     model, symmetries = models.of(search)
@@ -54,7 +59,8 @@ def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]
         is_right = state in (RIGHT, HIDDEN)
         is_other = distance < RIGHT_BELOW and not is_right
         is_nearly = search.scale == 1 and NEARLY[0] < distance < NEARLY[1]
-        if pose.measures is not None and pose.measures.noise < SHARP and not is_other and not is_nearly:
+        is_weighed = pose.measures is not None and (is_fused(search) or pose.measures.noise < SHARP)
+        if is_weighed and not is_other and not is_nearly:
             yield terms(pose.measures), is_right
 
 
@@ -62,12 +68,23 @@ def main() -> None:
     """Collect, fit, print."""
     args = cli.parse(__doc__, cli.flag("--quick", "one or two scenes of each kind"))
     models = Models()
-    rows: list[tuple[str, list[float], bool]] = []
+    rows: dict[str, list[tuple[str, list[float], bool]]] = {"SHARP": [], "FUSED": []}
     for regime in REGIMES:
         for search in ROWS[regime]("tuning", args.quick):
             is_nearly_size = search.scale != 1 and 0.85 < search.scale < 1.15
-            if search.scan.half == "tuning" and "viewpoint" in search.scan.told and not is_nearly_size:
-                rows += [(regime, *pose) for pose in decided(search, models)]
+            if search.scan.half == "tuning" and not is_nearly_size:
+                weights = "FUSED" if is_fused(search) else "SHARP"
+                rows[weights] += [(regime, *pose) for pose in decided(search, models)]
+    for weights, poses in rows.items():
+        show(f"\n{weights}, {len(poses)} poses")
+        fit(poses)
+
+
+def fit(rows: list[tuple[str, list[float], bool]]) -> None:
+    """Fit and print the weights of poses: regime, terms, whether it is right."""
+    if len({right for _, _, right in rows}) < 2:
+        show("none of them right, or all: no fit")
+        return
     of, right = np.array([row[1] for row in rows]), np.array([row[2] for row in rows], dtype=float)
     regimes = np.array([row[0] for row in rows])
     weight = np.zeros(len(rows))

@@ -20,8 +20,6 @@ from verdict_metrics import Judgement, centred, judge
 Half = Literal["tuning", "reporting"]
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
-TAKES_EYES = True
-"""Whether `Model.detect` takes all the eyes of a scan; if not, it is told one of them."""
 KINDS = ("bracket", "flange", "bolt", "clip", "pin")
 PIECES = ("chair", "table", "shelf")
 GAPS = (0, 1, 4, 10)
@@ -117,7 +115,7 @@ class Search:
 
 def told_by_eyes(room: synth.Room) -> dict[str, Any]:
     """Return what `Model.detect` is told of a room whose eyes are known."""
-    return {"tgt_normals": room.normals, "viewpoint": room.eyes if TAKES_EYES else room.eyes[0]}
+    return {"tgt_normals": room.normals, "viewpoint": room.eyes}
 
 
 def told_without_eyes(room: synth.Room) -> dict[str, Any]:

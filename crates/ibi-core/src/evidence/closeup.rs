@@ -70,8 +70,8 @@ struct At {
 }
 
 impl Closeup {
-    /// Of what was `measured` from the viewpoint of a scene with oriented normals. `None` for others, where the noise blurs what is
-    /// to be told apart, or if interrupted.
+    /// Of what was `measured` from the viewpoints of a scene with oriented normals. `None` for others, where the noise of a scan that was
+    /// not fused blurs what is to be told apart, or if interrupted.
     pub(crate) fn new(scene: &Scene<'_>, measured: &Measurement<'_>, interrupt: &Interrupt) -> Option<Self> {
         let normals = scene.source.normals.as_ref().filter(|_| scene.is_one_sided())?;
         let places = &scene.target.viewpoints;
@@ -180,11 +180,7 @@ impl Closeup {
 
     /// Of the eyes that know most of what lies around a pose.
     fn asked(&self, scene: &Scene<'_>, pose: &Isometry3<f64>) -> Vec<&Rays> {
-        let places: Vec<Point3<f64>> = self.rays.iter().map(|rays| *rays.eye()).collect();
-        asked(&places, &(pose * scene.source.centre), FEW_EYES)
-            .into_iter()
-            .map(|row| &self.rays[row])
-            .collect()
+        asked(&self.rays, Rays::eye, &(pose * scene.source.centre), FEW_EYES)
     }
 
     fn scan<'s>(scene: &'s Scene<'_>) -> Option<Scan<'s>> {

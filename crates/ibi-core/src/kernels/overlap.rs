@@ -269,14 +269,11 @@ impl<'a> Sighted<'a> {
         target_from_source: &Isometry3<f64>,
         tolerance: f64,
     ) -> Self {
-        let places: Vec<Point3<f64>> = view.eyes.iter().map(|eye| eye.place).collect();
         let middle = view.own.map_or_else(Point3::origin, |own| *own.middle());
-        let with_shadow = |row: usize| {
-            let eye = &view.eyes[row];
-            (eye, view.own.map_or(&[][..], |own| own.from(&eye.place, target_from_source)))
-        };
+        let with_shadow =
+            |eye: &'a Eye| (eye, view.own.map_or(&[][..], |own| own.from(&eye.place, target_from_source)));
         // Of a camera that went about the nearest place sees enough to tell poses from each other.
-        let asked = asked(&places, &(target_from_source * middle), 1);
+        let asked = asked(view.eyes, |eye| &eye.place, &(target_from_source * middle), 1);
         let eyes = asked.into_iter().map(with_shadow).collect();
         Self { eyes, normals, tolerance }
     }

@@ -57,17 +57,23 @@ pub struct View<'a> {
 /// All of so many eyes are asked of a pose.
 pub(crate) const FEW_EYES: usize = 4;
 
-/// Which of `eyes` are asked of what lies around a place: all, or of more than [`FEW_EYES`] so many as `of_many`, the nearest first,
+/// Those of `eyes`, which are `at` places, that are asked of what lies around a place: all, or of more than [`FEW_EYES`] so many as `of_many`, the nearest first,
 /// and then, each time, the one that looks from farthest beside those.
 #[must_use]
-pub(crate) fn asked(eyes: &[Point3<f64>], place: &Point3<f64>, of_many: usize) -> Vec<usize> {
+pub(crate) fn asked<'a, E>(
+    eyes: &'a [E],
+    at: impl Fn(&'a E) -> &'a Point3<f64>,
+    place: &Point3<f64>,
+    of_many: usize,
+) -> Vec<&'a E> {
     if eyes.len() <= FEW_EYES {
-        return (0..eyes.len()).collect();
+        return eyes.iter().collect();
     }
-    let ways: Vec<Vector3<f64>> = eyes.iter().map(|eye| eye - place).collect();
+    let ways: Vec<Vector3<f64>> = eyes.iter().map(|eye| at(eye) - place).collect();
     let nearest = (0..eyes.len()).min_by(|&a, &b| ways[a].norm_squared().total_cmp(&ways[b].norm_squared()));
     let directions: Vec<_> = ways.iter().map(|way| way.try_normalize(0.0).unwrap_or_default()).collect();
-    spread(nearest.unwrap_or(0), of_many, eyes.len(), |a, b| (directions[a] - directions[b]).norm_squared())
+    let far = |a: usize, b: usize| (directions[a] - directions[b]).norm_squared();
+    spread(nearest.unwrap_or(0), of_many, eyes.len(), far).into_iter().map(|row| &eyes[row]).collect()
 }
 
 /// `most` of `count` things, or all: the `first`, and then, each time, the one that is farthest from all before it.
