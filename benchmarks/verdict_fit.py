@@ -104,7 +104,7 @@ def fit(rows: list[tuple[str, list[float], bool]]) -> None:
     show(tables.markdown(TERMS, [[f"{w:.2f}" for w in weights]]))
     accepted = of @ weights > 0
     lines = []
-    for regime in REGIMES:
+    for regime in dict.fromkeys(row[0] for row in rows):
         ours = regimes == regime
         hits = int((accepted & ours & (right > 0)).sum())
         lines.append(
