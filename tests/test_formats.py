@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from ibi_rs import InputError, io
 from test_io import BALL, NORMALS, POINTS, Image, exported, las, table, trimesh
-
-WATCHDOG_S = 120
+from test_process import LIMIT_S
 
 
 def written(folder, name, content):
@@ -231,9 +230,7 @@ def test_what_stands_behind_the_points_is_not_looked_at(suffix, tmp_path):
     path = written(tmp_path, f"a.{suffix}", with_numbers(suffix, "QI", [(235, len(las(suffix)), 2**32 - 1)]))
     # In a process of its own, as one that went on for hours could not be ended.
     code = "import sys; from ibi_rs import io; print(len(io.read_cloud(sys.argv[1])[0]))"
-    done = subprocess.run(
-        [sys.executable, "-c", code, path], timeout=WATCHDOG_S, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code, path], timeout=LIMIT_S, capture_output=True, text=True)
     assert done.stdout.split() == ["50"], done.stderr
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ibi_rs import _interrupts, io, plot, viz
 from ibi_rs.synth.descriptors import load_open3d
+from test_process import LIMIT_S
 
 # A module in whose middle Ctrl-C comes, and which catches all there is to catch.
 SWALLOWS = """
@@ -93,7 +94,9 @@ def test_ctrl_c_in_an_import_of_the_command_ends_it(fake, tmp_path):
     # The folder goes first, and the package is found where it is found here.
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
     command = [sys.executable, "-m", "ibi_rs.cli", "register", model, scene, "--output", output]
-    ran = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60, check=False)
+    ran = subprocess.run(
+        command, capture_output=True, text=True, env=environment, timeout=LIMIT_S, check=False
+    )
     assert (ran.stderr, ran.returncode, output.exists()) == ("ibi: interrupted\n", 130, False)
 
 

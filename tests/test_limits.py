@@ -8,8 +8,7 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import _core, features, metrics
-
-WATCHDOG_S = 30
+from test_process import LIMIT_S
 
 
 def ball(count, seed=0):
@@ -133,7 +132,7 @@ def test_ctrl_c_is_heard_within_the_call(monkeypatch, name, num_threads):
         if begins == phase and not within:
             within.append(None)
             signal.raise_signal(signal.SIGINT)
-            within[0] = heard.wait(WATCHDOG_S)
+            within[0] = heard.wait(LIMIT_S)
 
     before = signal.signal(signal.SIGINT, handler)
     _core._watch(told)

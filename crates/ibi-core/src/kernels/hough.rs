@@ -1,7 +1,12 @@
 //! Votes for a place, gathered in the cells of a grid; sparse, so that memory grows with the votes and not with the room.
 
+use std::collections::HashMap;
+
 /// A cell: x, y, z in multiples of its width.
 pub type Cell = [i32; 3];
+
+/// Less than a millisecond of work.
+const VOTES_AN_ASK: usize = 4096;
 
 /// The eight cells whose centres surround a place, and what a vote there adds to each: its trilinear weights, of sum 1.
 pub fn shares(place: [f32; 3], width: f32) -> impl Iterator<Item = (Cell, f32)> {
@@ -19,26 +24,27 @@ pub fn shares(place: [f32; 3], width: f32) -> impl Iterator<Item = (Cell, f32)> 
 }
 
 /// The voters of the cell that gathers the most, each with what it adds, in the order of `votes`: (voter, place), voters
-/// ascending. Of cells that gather as much the lowest wins. Without a vote there are no voters.
+/// ascending. Of cells that gather as much the lowest wins. Without a vote, or once `interrupted`, there are no voters.
 ///
 /// # Complexity
-/// O(n log n) time, 160 bytes a vote.
+/// O(n) time, 16 bytes for each cell that has a vote, of which there are 8 n at most.
 #[must_use]
-pub fn peak(votes: &[(u32, [f32; 3])], width: f32) -> Vec<(u32, f32)> {
-    let mut all: Vec<(Cell, u32, f32)> = Vec::with_capacity(8 * votes.len());
-    for &(voter, place) in votes {
-        all.extend(
-            shares(place, width).filter(|&(_, share)| share > 0.0).map(|(cell, share)| (cell, voter, share)),
-        );
-    }
-    // By voter within a cell: so are the sums, whatever the sort does.
-    all.sort_unstable_by_key(|&(cell, voter, _)| (cell, voter));
-    let mut best: (f32, &[(Cell, u32, f32)]) = (0.0, &[]);
-    for votes in all.chunk_by(|a, b| a.0 == b.0) {
-        let sum = votes.iter().map(|&(.., share)| share).sum();
-        if sum > best.0 {
-            best = (sum, votes);
+pub fn peak(votes: &[(u32, [f32; 3])], width: f32, interrupted: impl Fn() -> bool) -> Vec<(u32, f32)> {
+    let mut sums: HashMap<Cell, f32> = HashMap::new();
+    for votes in votes.chunks(VOTES_AN_ASK) {
+        if interrupted() {
+            return Vec::new();
+        }
+        for (cell, share) in votes.iter().flat_map(|&(_, place)| shares(place, width)) {
+            // NaN has no share either.
+            if share > 0.0 {
+                *sums.entry(cell).or_default() += share;
+            }
         }
     }
-    best.1.iter().map(|&(_, voter, share)| (voter, share)).collect()
+    let Some((&best, _)) = sums.iter().max_by(|(a, x), (b, y)| x.total_cmp(y).then(b.cmp(a))) else {
+        return Vec::new();
+    };
+    let part = |place| shares(place, width).find(|&(cell, share)| cell == best && share > 0.0);
+    votes.iter().filter_map(|&(voter, place)| Some((voter, part(place)?.1))).collect()
 }

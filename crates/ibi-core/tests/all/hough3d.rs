@@ -81,7 +81,7 @@ proptest! {
     #[test]
     fn the_peak_is_the_cell_that_gathers_most(places in prop::collection::vec(prop::array::uniform3(-4.0..4.0_f32), 0..60)) {
         let votes: Vec<(u32, [f32; 3])> = (0_u32..).step_by(2).zip(places.iter().copied()).collect();
-        let found = peak(&votes, 1.0);
+        let found = peak(&votes, 1.0, || false);
         let places: Vec<[f64; 3]> = places.iter().map(|place| place.map(f64::from)).collect();
         let range = -6..6_i64;
         let cells = range.clone().flat_map(|x| range.clone().flat_map(move |y| (-6..6).map(move |z| [x, y, z])));
@@ -113,10 +113,11 @@ fn no_frame_where_no_direction_is_special() {
 #[test]
 fn votes_from_far_away_end_somewhere_or_nowhere() {
     let votes = |place: [f32; 3]| (0..5).map(|voter| (voter, place)).collect::<Vec<_>>();
-    assert_eq!(peak(&votes([3e20, f32::MAX, -f32::MAX]), 1.0).len(), 5);
+    assert_eq!(peak(&votes([3e20, f32::MAX, -f32::MAX]), 1.0, || false).len(), 5);
     // Beyond the floats is nowhere.
-    assert!(peak(&votes([1.0, f32::MAX, -2.0]), 1e-9).is_empty());
-    assert!(peak(&[], 1.0).is_empty());
+    assert!(peak(&votes([1.0, f32::MAX, -2.0]), 1e-9, || false).is_empty());
+    assert!(peak(&[], 1.0, || false).is_empty());
+    assert!(peak(&votes([1.0; 3]), 1.0, || true).is_empty());
 }
 
 // --------------------------------------------------------------------------------------------------- the stage

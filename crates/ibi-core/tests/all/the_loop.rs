@@ -14,7 +14,7 @@ use ibi_core::{
 };
 
 /// After so long a test fails rather than hangs.
-const WATCHDOG: Duration = Duration::from_secs(120);
+const WATCHDOG: Duration = Duration::from_secs(1200);
 
 /// Not `Params::default()`, which may change.
 fn base() -> Params {

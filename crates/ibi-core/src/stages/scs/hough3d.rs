@@ -12,7 +12,7 @@ use crate::stages::{Context, Ranked, SelectSeeds};
 /// frames at its two points; the voters of the cell with the most votes are the seeds (Tombari & Di Stefano 2010).
 ///
 /// Frames that are not given are computed from the clouds, once a run, at the points that correspondences use. Memory: 16
-/// bytes a correspondence, and 176 each while a round counts.
+/// bytes a correspondence, and up to 300 each while a round counts.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(
     feature = "serde",
@@ -82,6 +82,6 @@ impl SelectSeeds for Hough3d {
         let all = context.votes.get_or_init(|| self.votes(context));
         let free = context.alive.ids().iter().copied().filter(|&id| !context.barred[id as usize]);
         let votes: Vec<(u32, [f32; 3])> = free.filter_map(|id| Some((id, all[id as usize]?))).collect();
-        Ranked::new(peak(&votes, self.bin_pr as f32))
+        Ranked::new(peak(&votes, self.bin_pr as f32, || context.interrupt.is_set()))
     }
 }
