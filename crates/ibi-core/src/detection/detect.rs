@@ -144,7 +144,7 @@ impl Model {
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
         let wanted = options.wanted(params.oriented_normals);
-        let shared = pool.install(|| Shared::new(scan, wanted, || Ok(self.diameter(&interrupt)?)));
+        let shared = pool.install(|| Shared::new(scan, wanted, || self.told(&interrupt)));
         drop(pool);
         match shared {
             Ok(mut shared) => self.search(&mut shared, options, params, start, set_up, observer),
@@ -217,8 +217,13 @@ impl Model {
         interrupt: &Interrupt,
     ) -> Result<MatchedScan, DetectionError> {
         self.check()?;
-        let mut shared = Shared::new(scan, options.wanted(false), || Ok(self.diameter(interrupt)?))?;
+        let mut shared = Shared::new(scan, options.wanted(false), || self.told(interrupt))?;
         self.matched(&mut shared, options.check_units, interrupt)
+    }
+
+    /// Its diameter and its faces.
+    pub(super) fn told(&self, interrupt: &Interrupt) -> Result<(f64, Vec<[f64; 2]>), DetectionError> {
+        Ok((self.diameter(interrupt)?, self.faces(interrupt)?.to_vec()))
     }
 
     /// Whether it can be detected.

@@ -20,6 +20,7 @@ mod detect;
 mod doubts;
 mod error;
 mod extent;
+mod faces;
 mod model;
 mod models;
 mod rivals;

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use nalgebra::{Point3, Vector3};
 
+use super::faces::faces;
 use super::surface::{FromMesh, MeshSymmetries, Surface};
 use super::{DetectionError, Run, VOXELS_PER_SPACING};
 use crate::error::Error;
@@ -59,6 +60,8 @@ pub struct Model {
     /// At each voxel that a scan has asked for.
     described: Mutex<BTreeMap<u64, Arc<Described>>>,
     pub(super) inward: OnceLock<f64>,
+    /// How long and how wide its faces are, once asked for.
+    faces: OnceLock<Vec<[f64; 2]>>,
 }
 
 /// What the points of a model are from.
@@ -128,7 +131,7 @@ impl Model {
     fn until(cloud: &Cloud<'static>, origin: Origin, interrupt: &Interrupt) -> Result<Self, DetectionError> {
         let source = Arc::new(PreparedCloud::source_until(cloud, interrupt)?);
         let normals = cloud.normals.clone();
-        Ok(Self { source, normals, origin, described: Mutex::default(), inward: OnceLock::new() })
+        Ok(Self { source, normals, origin, described: Mutex::default(), inward: OnceLock::new(), faces: OnceLock::new() })
     }
 
     /// What a [`crate::Registrar`] takes.
@@ -173,6 +176,17 @@ impl Model {
     /// Largest distance of two points, data units.
     pub(super) fn diameter(&self, interrupt: &Interrupt) -> Result<f64, Error> {
         self.source.diameter(interrupt).ok_or_else(|| interrupt.error())
+    }
+
+    /// How long and how wide its flat faces are, data units; none without normals.
+    pub(super) fn faces(&self, interrupt: &Interrupt) -> Result<&[[f64; 2]], Error> {
+        if let Some(known) = self.faces.get() {
+            return Ok(known);
+        }
+        let normals = self.source.normals.as_deref().unwrap_or_default();
+        let points = if normals.is_empty() { &[] } else { self.points() };
+        let found = faces(points, normals, self.voxel(), interrupt).ok_or_else(|| interrupt.error())?;
+        Ok(self.faces.get_or_init(|| found.into_iter().map(|face| face.extents).collect()))
     }
 
     /// Its descriptors at a voxel, made when first asked for.

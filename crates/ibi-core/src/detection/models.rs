@@ -136,12 +136,15 @@ impl Models {
         self.models().try_for_each(|model| model.check().map(|_| ()))?;
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
-        let largest = || {
-            let mut diameters = self.models().map(|model| model.diameter(&interrupt));
-            diameters.try_fold(0.0, |most: f64, diameter| Ok(most.max(diameter?)))
+        let told = || {
+            self.models().try_fold((0.0, Vec::new()), |(most, mut faces): (f64, _), model| {
+                let (diameter, of_model) = model.told(&interrupt)?;
+                faces.extend(of_model);
+                Ok((most.max(diameter), faces))
+            })
         };
         let mut shared =
-            match pool.install(|| Shared::new(scan, options.wanted(params.oriented_normals), largest)) {
+            match pool.install(|| Shared::new(scan, options.wanted(params.oriented_normals), told)) {
                 Ok(shared) => Some(shared),
                 Err(error) if error.is_interrupted() => None,
                 Err(error) => return Err(error),

@@ -6,9 +6,10 @@ use nalgebra::{Point3, Vector3};
 
 use super::bodies::{Body, bodies};
 use super::extent::extent;
+use super::faces::{faces, is_larger};
 use super::{DetectionError, VOXELS_PER_SPACING};
 use crate::error::{Argument, Error};
-use crate::features::{Neighborhood, Plane, PlaneSearch, dominant_plane, estimate_normals, voxel_downsample};
+use crate::features::{FeatureError, Neighborhood, Plane, PlaneSearch, dominant_plane, estimate_normals, voxel_downsample};
 use crate::interrupt::Interrupt;
 use crate::kernels::nearby::Nearby;
 use crate::kernels::neighbors::Neighbors;
@@ -119,19 +120,21 @@ pub(super) struct Prepared {
 
 /// What is known of a scan that is to be prepared for a model.
 #[derive(Clone, Copy)]
-pub(super) struct Setting {
+pub(super) struct Setting<'a> {
     /// Of the model.
     pub(super) voxel: f64,
     /// Of the model.
     pub(super) diameter: f64,
     pub(super) viewpoint: Option<Point3<f64>>,
     pub(super) remove_plane: Option<bool>,
+    /// How long and how wide the faces of all models are.
+    pub(super) faces: &'a [[f64; 2]],
 }
 
 impl Prepared {
     pub(super) fn new(
         measured: &Measured,
-        setting: &Setting,
+        setting: &Setting<'_>,
         interrupt: &Interrupt,
     ) -> Result<Self, DetectionError> {
         let given = setting.voxel;
@@ -157,14 +160,23 @@ impl Prepared {
             let steps = (VOXEL_STEPS_PER_DOUBLING * (filled / given).log2()).ceil();
             voxel = given * 2_f64.powf(steps / VOXEL_STEPS_PER_DOUBLING);
         };
-        let points = picked(&whole.points, &left);
-        let normals = if let Some(normals) = &whole.normals {
+        let mut points = picked(&whole.points, &left);
+        let mut normals = if let Some(normals) = &whole.normals {
             picked(normals, &left)
         } else {
             let neighborhood =
                 Neighborhood { radius: NORMAL_VOXELS * voxel, max_neighbors: NORMAL_NEIGHBORS };
             estimate_normals(&points, neighborhood, setting.viewpoint, interrupt)?
         };
+        if setting.remove_plane != Some(false) {
+            let found = faces(&points, &normals, voxel, interrupt).ok_or(FeatureError::Interrupted)?;
+            let mut stays = vec![true; points.len()];
+            for face in found.iter().filter(|face| is_larger(face.extents, setting.faces, voxel)) {
+                face.rows.iter().for_each(|&row| stays[row as usize] = false);
+            }
+            let rows: Vec<usize> = (0..points.len()).filter(|&row| stays[row]).collect();
+            (points, normals) = (picked(&points, &rows), picked(&normals, &rows));
+        }
         let (whole, whole_normals) = (whole.points, whole.normals);
         Ok(Self { points, normals, voxel, whole, whole_normals, is_behind_table })
     }
@@ -205,7 +217,7 @@ impl Table {
     fn of(
         points: &[Point3<f64>],
         voxel: f64,
-        setting: &Setting,
+        setting: &Setting<'_>,
         interrupt: &Interrupt,
     ) -> Result<Self, DetectionError> {
         let is_sure = setting.remove_plane == Some(true);

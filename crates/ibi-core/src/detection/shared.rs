@@ -29,6 +29,7 @@ pub(super) struct Shared<'a> {
     pub(super) searched: Measured,
     /// Of the largest of the models.
     diameter: f64,
+    faces: Vec<[f64; 2]>,
     ready: BTreeMap<u64, Ready>,
 }
 
@@ -52,11 +53,11 @@ pub(super) struct Ready {
 }
 
 impl<'a> Shared<'a> {
-    /// Checks a scan. `diameter`: of the largest model.
+    /// Checks a scan. `model`: the diameter of the largest model, and the faces of all.
     pub(super) fn new(
         scan: &'a Cloud<'a>,
         Wanted { roi, remove_plane, is_sided }: Wanted<'_>,
-        diameter: impl FnOnce() -> Result<f64, DetectionError>,
+        model: impl FnOnce() -> Result<(f64, Vec<[f64; 2]>), DetectionError>,
     ) -> Result<Self, DetectionError> {
         if scan.viewpoints.is_empty() && scan.normals.is_none() {
             return Err(DetectionError::NoSide);
@@ -70,7 +71,7 @@ impl<'a> Shared<'a> {
             let (num_missing, len) = (measured.num_without_normal, measured.points.len());
             return Err(DetectionError::MostNormalsMissing { num_missing, len });
         }
-        let diameter = diameter()?;
+        let (diameter, faces) = model()?;
         let viewpoints = match &measured.normals {
             Some(normals) if scan.viewpoints.is_empty() && is_sided => {
                 standpoints(&measured.points, normals, diameter)
@@ -91,6 +92,7 @@ impl<'a> Shared<'a> {
             normals_of_all,
             searched,
             diameter,
+            faces,
             ready: BTreeMap::new(),
         })
     }
@@ -115,8 +117,13 @@ impl<'a> Shared<'a> {
         match self.ready.entry(voxel.to_bits()) {
             Entry::Occupied(ready) => Ok(ready.into_mut()),
             Entry::Vacant(place) => {
-                let setting =
-                    Setting { voxel, diameter: self.diameter, viewpoint, remove_plane: self.remove_plane };
+                let setting = Setting {
+                    voxel,
+                    diameter: self.diameter,
+                    viewpoint,
+                    remove_plane: self.remove_plane,
+                    faces: &self.faces,
+                };
                 let mut prepared = Prepared::new(&self.searched, &setting, interrupt)?;
                 let given = &self.scan.viewpoints;
                 if given.len() > 1 && self.scan.normals.is_none() {
