@@ -18,13 +18,15 @@ from scipy.optimize import minimize
 from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW
 from verdict_searches import ROWS, Models, Search
 
-TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness")
-SHARP = 0.12
+TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness", "supported")
+SHARP = 0.2
 """As in odds.rs: the noise up to which a scan is sharp, voxels."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
 REGIMES = ("boxes", "scans", "bins", "rows", "rooms", "mirror", "sizes", "absent")
-POWER = 0.7
+POWER = 0.5
 """A class of n poses in a regime weighs n to 1 minus this."""
+SIGNS = [(None, None), *[(None, 0)] * 3, *[(0, None)] * 4]
+"""What speaks against a pose may not speak for it."""
 
 
 def terms(of: ibi.Measures) -> list[float]:
@@ -34,12 +36,13 @@ def terms(of: ibi.Measures) -> list[float]:
     held = np.sqrt(np.clip(of.losses, 0, 1))
     return [
         1.0,
-        min(of.contradicted / (known + 20), 0.3),
+        min(of.contradicted / (known + 20), 0.1),
         (of.runs_on - 0.5 * ends) / (ends + 15),
         min(of.beyond / (of.on + 20), 0.2),
         held[1],
         held[2],
         float(np.clip(of.closeness, -0.5, 1.1)),
+        of.supported / (known + of.hidden + 20),
     ]
 
 
@@ -100,7 +103,7 @@ def fit(rows: list[tuple[str, list[float], bool]]) -> None:
             np.average(np.logaddexp(0, odds) - right * odds, weights=weight) + 1.5e-3 * b[1:] @ b[1:]
         )
 
-    weights = minimize(loss, np.zeros(len(TERMS)), method="L-BFGS-B").x / spread
+    weights = minimize(loss, np.zeros(len(TERMS)), method="L-BFGS-B", bounds=SIGNS).x / spread
     show(tables.markdown(TERMS, [[f"{w:.2f}" for w in weights]]))
     accepted = of @ weights > 0
     lines = []
