@@ -18,14 +18,14 @@ from scipy.optimize import minimize
 from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW
 from verdict_searches import ROWS, Models, Search
 
-TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness", "supported")
+TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness", "supported", "ends", "evidence")
 SHARP = 0.2
 """As in odds.rs: the noise up to which a scan is sharp, voxels."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
 REGIMES = ("boxes", "scans", "bins", "rows", "rooms", "mirror", "sizes", "absent")
-POWER = 0.5
-"""A class of n poses in a regime weighs n to 1 minus this."""
-SIGNS = [(None, None), *[(None, 0)] * 3, *[(0, None)] * 4]
+POWER = {"SHARP": 0.5, "FUSED": 0.2}
+"""A class of n poses in a regime weighs n to 1 minus this. In rooms nothing may be invented."""
+SIGNS = [(None, None), *[(None, 0)] * 3, *[(0, None)] * 6]
 """What speaks against a pose may not speak for it."""
 
 
@@ -43,6 +43,8 @@ def terms(of: ibi.Measures) -> list[float]:
         held[2],
         float(np.clip(of.closeness, -0.5, 1.1)),
         of.supported / (known + of.hidden + 20),
+        float(np.log1p(of.ends)),
+        float(np.log1p(of.evidence)),
     ]
 
 
@@ -80,10 +82,10 @@ def main() -> None:
                 rows[weights] += [(regime, *pose) for pose in decided(search, models)]
     for weights, poses in rows.items():
         show(f"\n{weights}, {len(poses)} poses")
-        fit(poses)
+        fit(poses, POWER[weights])
 
 
-def fit(rows: list[tuple[str, list[float], bool]]) -> None:
+def fit(rows: list[tuple[str, list[float], bool]], power: float) -> None:
     """Fit and print the weights of poses: regime, terms, whether it is right."""
     if len({right for _, _, right in rows}) < 2:
         show("none of them right, or all: no fit")
@@ -94,7 +96,7 @@ def fit(rows: list[tuple[str, list[float], bool]]) -> None:
     for regime in set(regimes):
         for answer in (0, 1):
             of_class = (regimes == regime) & (right == answer)
-            weight[of_class] = of_class.sum() ** -POWER if of_class.any() else 0.0
+            weight[of_class] = of_class.sum() ** -power if of_class.any() else 0.0
     spread = np.r_[1.0, of[:, 1:].std(axis=0)]
 
     def loss(b: np.ndarray) -> float:

@@ -131,7 +131,14 @@ impl Model {
     fn until(cloud: &Cloud<'static>, origin: Origin, interrupt: &Interrupt) -> Result<Self, DetectionError> {
         let source = Arc::new(PreparedCloud::source_until(cloud, interrupt)?);
         let normals = cloud.normals.clone();
-        Ok(Self { source, normals, origin, described: Mutex::default(), inward: OnceLock::new(), faces: OnceLock::new() })
+        Ok(Self {
+            source,
+            normals,
+            origin,
+            described: Mutex::default(),
+            inward: OnceLock::new(),
+            faces: OnceLock::new(),
+        })
     }
 
     /// What a [`crate::Registrar`] takes.

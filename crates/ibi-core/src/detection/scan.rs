@@ -9,7 +9,9 @@ use super::extent::extent;
 use super::faces::{faces, is_larger};
 use super::{DetectionError, VOXELS_PER_SPACING};
 use crate::error::{Argument, Error};
-use crate::features::{FeatureError, Neighborhood, Plane, PlaneSearch, dominant_plane, estimate_normals, voxel_downsample};
+use crate::features::{
+    FeatureError, Neighborhood, Plane, PlaneSearch, dominant_plane, estimate_normals, voxel_downsample,
+};
 use crate::interrupt::Interrupt;
 use crate::kernels::nearby::Nearby;
 use crate::kernels::neighbors::Neighbors;

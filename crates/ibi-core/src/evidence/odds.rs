@@ -40,16 +40,18 @@ const MOST_BEYOND: f64 = 0.2;
 /// Closeness beyond these says no more.
 const CLOSENESS: [f64; 2] = [-0.5, 1.1];
 
-/// Weights of 1, contradicted, running on, beyond, the second and third loss, closeness, and the share supported, where a scan is sharp: a logistic
-/// regression over the poses, right and wrong, of searches in the tuning half of `benchmarks/verdict.py`, as they stood when it was
-/// decided on them, none of which may be of the wrong sign: `benchmarks/verdict_fit.py` fits them anew, to the poses of today. The first
-/// loss told nothing beside the others, and nor did the third.
-const SHARP: [f64; 8] = [-2.77, -26.9, -4.31, -35.9, 2.01, 0.0, 0.66, 2.24];
+/// How many weights there are: of 1, the share contradicted, how far faces run on, the share beyond, the second and third loss,
+/// closeness, the share supported, and the logarithms of the number of ends and of the evidence. The first loss told nothing beside them.
+const TERMS: usize = 10;
 
-/// The same where a scan was fused from many views: there a part is seen from several sides, so that a right pose is held by all of its
-/// faces, and a wrong one is given away. A logistic regression over the poses, found and rejected, of searches in rooms of the tuning half,
-/// with the eyes known and guessed, and of parts that are not in them; the second was held at -2, as it would have been above 0.
-const FUSED: [f64; 8] = [-17.5, -2.0, -10.3, -85.4, 12.3, 6.9, 3.3, 0.0];
+/// Weights where a scan is sharp: a logistic regression over the poses, right and wrong, of searches in the tuning half of
+/// `benchmarks/verdict.py`, found and rejected, none of which may be of the wrong sign: `benchmarks/verdict_fit.py` fits them anew, to
+/// the poses of today.
+const SHARP: [f64; TERMS] = [-2.77, -26.9, -4.31, -35.9, 2.01, 0.0, 0.66, 2.24, 0.0, 0.0];
+
+/// The same where a scan was fused from many views, to searches in rooms and for parts that are not in them: there a part is seen from
+/// several sides, so that a right pose is held by all of its faces, and has more ends that are seen past than a wrong one.
+const FUSED: [f64; TERMS] = [-14.7, -9.6, -4.6, -45.3, 4.1, 2.0, 0.0, 3.3, 1.46, 0.47];
 
 /// Standard deviations of the noise, voxels: up to the first a scan is sharp, and from the second on a close look tells no more than
 /// the clouds; in between it counts in proportion. At the second, two and a half deviations are more than a pose is known to before it
@@ -86,7 +88,7 @@ impl Measures {
         supported / (facing + FEW_POINTS)
     }
 
-    fn weights(&self) -> &'static [f64; 8] {
+    fn weights(&self) -> &'static [f64; TERMS] {
         if self.is_fused { &FUSED } else { &SHARP }
     }
 
@@ -96,8 +98,18 @@ impl Measures {
         let [contradicted, runs_on, beyond] = self.objections();
         let closeness = self.closeness.clamp(CLOSENESS[0], CLOSENESS[1]);
         let [_, second, third] = self.losses.map(held);
-        let seen = self.share_supported();
-        let sharp = [1.0, contradicted, runs_on, beyond, second, third, closeness, seen];
+        let sharp: [f64; TERMS] = [
+            1.0,
+            contradicted,
+            runs_on,
+            beyond,
+            second,
+            third,
+            closeness,
+            self.share_supported(),
+            f64::from(self.contour.ends).ln_1p(),
+            self.evidence.ln_1p(),
+        ];
         let blurred = [1.0, self.evidence.ln_1p(), self.closeness];
         // Of a fused scan the clouds alone tell nothing.
         let blur = if self.is_fused { 0.0 } else { self.noise };

@@ -714,9 +714,11 @@ fn what_speaks_for_a_pose_raises_its_odds() {
         let [worse, good] = [worse, good].map(|one| Measures { is_fused: true, ..one });
         assert!(worse.log_odds() < good.log_odds(), "fused {worse:?}");
     }
-    // The unknown speaks neither way.
-    let hidden = Measures { tally: Tally { hidden: 500, unknown: 99, away: 400, ..good.tally }, ..good };
-    assert_eq!(hidden.log_odds(), good.log_odds());
+    // Of what is hidden less is held; the unknown speaks neither way.
+    let hidden = Measures { tally: Tally { hidden: 500, ..good.tally }, ..good };
+    assert!(hidden.log_odds() < good.log_odds());
+    let unknown = Measures { tally: Tally { unknown: 99, away: 400, ..good.tally }, ..good };
+    assert_eq!(unknown.log_odds(), good.log_odds());
     assert_eq!(Measures::default().objections(), [0.0; 3]);
     let more = Measures { contour: Contour { unknown: 99, ..good.contour }, ..good };
     assert_eq!(more.log_odds(), good.log_odds());
