@@ -254,8 +254,8 @@ class Model:
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
 
-        The scene is thinned to :attr:`voxel`, or to what it can carry if it is coarser, its table taken away,
-        its normals estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined
+        The scene is thinned to :attr:`voxel`, or to what it can carry if it is coarser, its table and walls taken
+        away, its normals estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined
         to the four model points most like it.
 
         Parameters
@@ -311,7 +311,8 @@ class Model:
             normals are given: then places from which one could see the scene stand for the cameras.
         remove_plane : bool, optional
             Whether the plane with most points is taken away. By default it is where it looks like a table:
-            less than 2 % of the points lie behind it, as the viewpoint sees it.
+            less than 2 % of the points lie behind it, as the viewpoint sees it. Flat faces that are half as
+            long or wide again as any of the model are taken away unless this is False: walls, other parts.
         check_units : bool, default True
             Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts
             is the box around all points but the outermost hundredth on each side; fewer than 100 points tell

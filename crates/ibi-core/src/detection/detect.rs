@@ -40,7 +40,8 @@ pub struct Detect {
     /// [`Params::many_views`].
     pub params: Option<Params>,
     /// Whether the plane with most points is taken away. `None`: where it looks like a table, with less than 2 % of the
-    /// points behind it as the viewpoint sees it.
+    /// points behind it as the viewpoint sees it. Flat faces that are half as long or wide again as any of the model are taken away
+    /// unless this is `Some(false)`: walls, other parts.
     pub remove_plane: Option<bool>,
     /// Whether a scan is refused that is 10 times smaller than the model or 300 times larger. What counts is the box around
     /// all points but the outermost hundredth on each side; fewer than 100 points tell nothing.
@@ -76,7 +77,7 @@ impl Detect {
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct MatchedScan {
-    /// The scan, thinned and without its table.
+    /// The scan, thinned and without its table and walls.
     pub points: Vec<Point3<f64>>,
     /// One for each of them, of length 1.
     pub normals: Vec<Vector3<f64>>,
@@ -204,7 +205,7 @@ impl Model {
     /// Matches a scan with this model, which needs normals: the first half of [`Self::detect`], on the threads that it is
     /// called on.
     ///
-    /// The scan is thinned to [`Self::voxel`], or to what it can carry if it is coarser, its table taken away, its normals
+    /// The scan is thinned to [`Self::voxel`], or to what it can carry if it is coarser, its table and walls taken away, its normals
     /// estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined to the four model points
     /// most like it. Nothing is matched where the scan holds nothing but a table or stray points.
     ///

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
 
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Phase};
 use crate::kernels::nearby::Nearby;
 
 /// A flat piece of a surface that hangs together.
@@ -43,6 +43,9 @@ pub(super) fn faces(
     voxel: f64,
     interrupt: &Interrupt,
 ) -> Option<Vec<Face>> {
+    if !interrupt.enter(Phase::Plane) {
+        return None;
+    }
     let nearby = Nearby::new(points, LINK_VOXELS * voxel);
     let around = |row: u32| nearby.within(&points[row as usize], LINK_VOXELS * voxel);
     let mut flattest: Vec<(f64, u32)> = Vec::with_capacity(points.len());

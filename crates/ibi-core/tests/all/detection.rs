@@ -199,6 +199,33 @@ fn on_a_table(part: &Model) -> (Vec<Point3<f64>>, Point3<f64>) {
 }
 
 #[test]
+fn a_face_is_taken_away_where_it_is_larger_than_all_of_the_parts() {
+    let part = model(&shapes::cuboid([3.0, 2.0, 1.0]));
+    let eye = Point3::new(0.0, -30.0, 10.0);
+    let parts = seen(scene(&part, &placed(2, 5.0, 3)), &eye).0;
+    let kept = |[wide, high]: [f64; 2], remove_plane| {
+        // Upright behind the parts, which are the most of the scan; what is behind it makes it no table.
+        let steps = |length: f64| (0..=(length / 0.1) as i32).map(|i| 0.1 * f64::from(i));
+        let wall = steps(wide).flat_map(|x| steps(high).map(move |z| Point3::new(x, 4.0, z)));
+        let behind = parts.iter().map(|p| p + Vector3::new(0.0, 12.0, 0.0));
+        let points: Vec<_> = parts.iter().copied().chain(wall).chain(behind).collect();
+        let scan = Cloud::new(&points).with_viewpoint(eye);
+        let options = Detect { remove_plane, ..Detect::default() };
+        let matched = part.correspond(&scan, &options, &Interrupt::never()).unwrap();
+        let (wall, others): (Vec<_>, Vec<_>) =
+            matched.points.into_iter().partition(|p| (p.y - 4.0).abs() < 0.05);
+        (wall.len(), others.len())
+    };
+    for size in [[9.0, 2.0], [3.0, 5.0]] {
+        let (all, of_parts) = kept(size, Some(false));
+        let (left, of_parts_left) = kept(size, None);
+        assert!(all > 100 && left * 10 < all, "{size:?}: {left} of {all}");
+        assert_eq!(of_parts_left, of_parts);
+    }
+    assert_eq!(kept([3.2, 2.2], None), kept([3.2, 2.2], Some(false)));
+}
+
+#[test]
 fn a_table_is_taken_away() {
     let part = model(&shapes::lopsided());
     let (points, eye) = on_a_table(&part);
