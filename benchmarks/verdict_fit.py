@@ -19,8 +19,8 @@ from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW
 from verdict_searches import ROWS, Models, Search
 
 TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness", "supported", "ends", "evidence")
-SHARP = 0.2
-"""As in odds.rs: the noise up to which a scan is sharp, voxels."""
+SHARP = 0.1
+"""As in odds.rs: the blur up to which a scan is sharp."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
 REGIMES = ("boxes", "scans", "bins", "rows", "rooms", "mirror", "sizes", "absent")
 POWER = {"SHARP": 0.5, "FUSED": 0.2}
@@ -64,7 +64,7 @@ def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]
         is_right = state in (RIGHT, HIDDEN)
         is_other = distance < RIGHT_BELOW and not is_right
         is_nearly = search.scale == 1 and NEARLY[0] < distance < NEARLY[1]
-        is_weighed = pose.measures is not None and (is_fused(search) or pose.measures.noise < SHARP)
+        is_weighed = pose.measures is not None and (is_fused(search) or pose.measures.blur < SHARP)
         if is_weighed and not is_other and not is_nearly:
             yield terms(pose.measures), is_right
 

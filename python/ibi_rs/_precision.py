@@ -22,7 +22,8 @@ def check_step(name: str, points: npt.NDArray[np.float64], spacing: float | None
     sample = sample[np.isfinite(sample).all(axis=1)]
     if len(sample) < 3:
         return
-    distance = float(np.abs(np.median(sample, axis=0)).max())
+    # Of an even number of points the mean of the middle two may be beyond the floats.
+    distance = float(np.abs(np.quantile(sample, 0.5, axis=0, method="lower")).max())
     with np.errstate(over="ignore"):
         step = float(np.spacing(np.float32(distance)))
         # A step of a millionth is below the spacing of any cloud that fits into memory.

@@ -37,6 +37,8 @@ class Measures:
         three motions that are held least: near 0 where nothing holds it.
     noise : float
         Standard deviation of the scan across its surfaces, in voxels.
+    blur : float
+        The noise times the spacing of the measured points, both in voxels: that of all in a voxel together.
     closeness, evidence : float
         As of a :class:`Pose`, among the points that no other pose owned then.
     """
@@ -52,6 +54,7 @@ class Measures:
     on: int
     losses: tuple[float, float, float]
     noise: float
+    blur: float
     closeness: float
     evidence: float
 
@@ -70,6 +73,7 @@ class Measures:
             on=overrun["on"],
             losses=tuple(raw["losses"]),
             noise=raw["noise"],
+            blur=raw["blur"],
             closeness=raw["closeness"],
             evidence=raw["evidence"],
         )

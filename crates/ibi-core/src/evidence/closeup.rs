@@ -25,6 +25,7 @@ pub(crate) struct Closeup {
     rim: Rim,
     voxel: f64,
     noise: f64,
+    blur: f64,
     tolerance: Tolerance,
 }
 
@@ -97,14 +98,17 @@ impl Closeup {
         let voxel = VOXELS_PER_SPACING * scene.resolution;
         // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
         let noise = noise_of_rays(&rays[0], &scene.target.points);
-        if noise >= BLURRED * voxel && of_all.is_none() {
+        let points = &scene.target.points;
+        let distance = points.iter().map(|p| (p - rays[0].eye()).norm()).sum::<f64>() / points.len() as f64;
+        let blur = noise / voxel * (distance * rays[0].spacing() / voxel);
+        if blur >= BLURRED && of_all.is_none() {
             return None;
         }
         let tolerance = Tolerance::of(voxel, noise);
         let tolerance = Tolerance { aside: tolerance.aside.max(spacing), ..tolerance };
         let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
         let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);
-        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, tolerance })
+        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, blur, tolerance })
     }
 
     /// A pose settled, and what was measured of it.
@@ -155,6 +159,7 @@ impl Closeup {
                 overrun,
                 losses: losses_of,
                 noise: noise / voxel,
+                blur: self.blur,
                 is_fused: self.is_fused,
                 ..Measures::default()
             },

@@ -18,6 +18,8 @@ pub struct Measures {
     pub losses: [f64; 3],
     /// Standard deviation of the scan across its surfaces, voxels.
     pub noise: f64,
+    /// That of as many points as there are in a voxel, together: the noise times their spacing, both in voxels.
+    pub blur: f64,
     /// Whether the scan was fused from what several cameras measured, or one that went about.
     pub is_fused: bool,
     /// How close its points lie on the thinned clouds, see [`super::Support::closeness`].
@@ -53,12 +55,11 @@ const SHARP: [f64; TERMS] = [-2.77, -26.9, -4.31, -35.9, 2.01, 0.0, 0.66, 2.24, 
 /// several sides, so that a right pose is held by all of its faces, and has more ends that are seen past than a wrong one.
 const FUSED: [f64; TERMS] = [-14.7, -9.6, -4.6, -45.3, 4.1, 2.0, 0.0, 3.3, 1.46, 0.47];
 
-/// Standard deviations of the noise, voxels: up to the first a scan is sharp, and from the second on a close look tells no more than
-/// the clouds; in between it counts in proportion. At the second, two and a half deviations are more than a pose is known to before it
-/// is settled. Close looks are as sure in ray-cast scans of more noise; but in coarse real ones, of parts that are not quite the model's
-/// shape, they mistrust every pose.
-const NOISE: [f64; 2] = [0.17, BLURRED];
-pub(super) const BLURRED: f64 = 0.2;
+/// Up to the first a scan is sharp, and from the second on a close look tells no more than the clouds; in between it counts in
+/// proportion. Bins of the tuning half have 0.09 at most. Coarse real scans of parts that are not quite the model's shape have 0.12 and
+/// more: there a close look mistrusts every pose. (In ray-cast scans as coarse it is as sure as in sharp ones.)
+const BLUR: [f64; 2] = [0.1, BLURRED];
+pub(super) const BLURRED: f64 = 0.115;
 
 /// Of a loss the root: the step from none to a little tells most.
 fn held(loss: f64) -> f64 {
@@ -112,8 +113,8 @@ impl Measures {
         ];
         let blurred = [1.0, self.evidence.ln_1p(), self.closeness];
         // Of a fused scan the clouds alone tell nothing.
-        let blur = if self.is_fused { 0.0 } else { self.noise };
-        let blur = ((blur - NOISE[0]) / (NOISE[1] - NOISE[0])).clamp(0.0, 1.0);
+        let blur = if self.is_fused { 0.0 } else { self.blur };
+        let blur = ((blur - BLUR[0]) / (BLUR[1] - BLUR[0])).clamp(0.0, 1.0);
         let weighed =
             |terms: &[f64], weights: &[f64]| -> f64 { terms.iter().zip(weights).map(|(a, b)| a * b).sum() };
         (1.0 - blur) * weighed(&sharp, self.weights()) + blur * weighed(&blurred, &ONE_SIDED)

@@ -698,6 +698,7 @@ fn what_speaks_for_a_pose_raises_its_odds() {
         overrun: Overrun { beyond: 2, on: 250 },
         losses: [0.1, 0.2, 0.3],
         noise: 0.05,
+        blur: 0.02,
         is_fused: false,
         closeness: 0.9,
         evidence: 3.0,
