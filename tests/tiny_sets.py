@@ -93,6 +93,7 @@ def bop(root, *, scale=0.1, cameras=("",), split="test", targets="bop19"):
     for number, mesh in meshes.items():
         write_ply(root / f"models/obj_{number:06d}.ply", *mesh)
         info[str(number)] = {"diameter": ibi.metrics.diameter(mesh[0])}
+    info["1"] |= ibi.find_symmetries(sampled(tee())).to_bop()
     info["5"]["symmetries_discrete"] = [
         np.diag(turn).ravel().tolist() for turn in ([1, -1, -1, 1], [-1, 1, -1, 1], [-1, -1, 1, 1])
     ]

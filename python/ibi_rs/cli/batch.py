@@ -22,6 +22,7 @@ from ibi_rs._files import read_json, try_writing
 
 from .outputs import (
     as_dict,
+    millimetres,
     print_table,
     sha256,
     try_outputs,
@@ -39,6 +40,7 @@ from .search import (
     Search,
     SymmetriesOf,
     TimeoutS,
+    Unit,
     Viewpoint,
     Voxel,
     chosen_params,
@@ -82,8 +84,9 @@ def batch(
         Path | None, typer.Option("-o", "--output", help="Folder for the poses: a JSON for each scan.")
     ] = None,
     bop: Annotated[
-        Path | None, typer.Option(help="All poses as BOP's CSV: t in mm, if the unit is the metre.")
+        Path | None, typer.Option(help="All poses as BOP's CSV: t in mm.")
     ] = None,
+    unit: Unit = None,
     obj_id: Annotated[int, typer.Option(min=0, help="obj_id in the CSV.")] = 1,
     skip_existing: Annotated[
         bool,

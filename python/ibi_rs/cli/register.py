@@ -15,6 +15,7 @@ from ibi_rs._files import read_npy
 
 from .outputs import (
     as_dict,
+    millimetres,
     sha256,
     show,
     try_outputs,
@@ -33,6 +34,7 @@ from .search import (
     Search,
     SymmetriesOf,
     TimeoutS,
+    Unit,
     Viewpoint,
     Voxel,
     chosen_params,
@@ -74,8 +76,9 @@ def register(
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON.")] = None,
     bop: Annotated[
-        Path | None, typer.Option(help="Poses as BOP's CSV: t in mm, if the unit is the metre.")
+        Path | None, typer.Option(help="Poses as BOP's CSV: t in mm.")
     ] = None,
+    unit: Unit = None,
     plot: Annotated[
         Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
     ] = None,
@@ -162,7 +165,7 @@ def register(
     if bop is not None:
         of_parts = [found.of(i) for i in range(len(models))]
         rows = [(0, 0, np.asarray(one), [pose.score for pose in one], seconds) for one in of_parts]
-        write_bop(bop, rows, *range(1, len(models) + 1))
+        write_bop(bop, rows, *range(1, len(models) + 1), mm=mm)
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes

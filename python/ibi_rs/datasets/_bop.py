@@ -224,6 +224,16 @@ class Bop(Sequence[Scene]):
             )
         return self._kinds[obj_id]
 
+    @property
+    def ids(self) -> tuple[tuple[int, int], ...]:
+        """(scene_id, im_id) of each image."""
+        return tuple((scene_id, im_id) for scene_id, im_id, _ in self._targets)
+
+    @property
+    def objects(self) -> tuple[int, ...]:
+        """Numbers of all objects that are looked for in any image."""
+        return tuple(sorted({obj_id for _, _, objects in self._targets for obj_id in objects}))
+
     # Scenes ------------------------------------------------------------------------------------------------
 
     def __len__(self) -> int:

@@ -100,6 +100,10 @@ def write_bop_results(path: PathLike, images: Sequence[BopImage]) -> None:
         What is there is replaced, at the end.
     images : sequence of BopImage
         In any order.
+
+    Returns
+    -------
+    None
     """
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")

@@ -154,6 +154,10 @@ def write_pair(path: PathLike, src: Any, tgt: Any, poses: npt.ArrayLike = ()) ->
         target_from_source of all instances, written as float32 ``poses``; and the first again as ``rot``,
         (3, 3), and ``trans``, (3,), as networks for one instance want them.
 
+    Returns
+    -------
+    None
+
     Raises
     ------
     InputError, TypeError
