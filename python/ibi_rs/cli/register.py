@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 import ibi_rs as ibi
-from ibi_rs import io
+from ibi_rs import io, metrics
 from ibi_rs._files import read_npy
 
 from .outputs import (
@@ -75,9 +75,7 @@ def register(
         int | None, typer.Option(min=1, max=MAX_THREADS, help="Default: all that the process may use.")
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON.")] = None,
-    bop: Annotated[
-        Path | None, typer.Option(help="Poses as BOP's CSV: t in mm.")
-    ] = None,
+    bop: Annotated[Path | None, typer.Option(help="Poses as BOP's CSV: t in mm.")] = None,
     unit: Unit = None,
     plot: Annotated[
         Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
@@ -126,12 +124,14 @@ def register(
         if corr is not None:
             tgt, tgt_normals = io.read_cloud(scene)
             pairs = _pairs(corr)
+            mm = 0.0 if bop is None else millimetres(unit, metrics.diameter(io.read_cloud(model)[0]))
             src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
         else:
             scan = io.read_scan(scene)
             tgt, sight = scan.points, search.sight(scan.normals, scan.viewpoint)
             parts = [search.model(one, threads) for one in models]
             part = parts[0]
+            mm = 0.0 if bop is None else millimetres(unit, *(one.diameter for one in parts))
             src, held = part.points, part.symmetries
             status.update("detecting")
             kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
