@@ -10,9 +10,7 @@ from pathlib import Path
 import ibi_rs as ibi
 import numpy as np
 import pytest
-import tiny_sets
 from test_batch import EXPECTED, JOBS, MODEL, SCENES, content, values
-from test_cli import run
 from test_detector import MODEL as BOX_MODEL
 from test_detector import batch
 from test_process import LIMIT_S
@@ -148,28 +146,6 @@ def test_a_dask_bag_loses_no_scan_with_a_worker(dask_client, scans, tmp_path):
     check(found, poses)
 
 
-def bop_on(cluster, root, path):
-    """Poses that `ibi bop` finds there."""
-    result = run("bop", root, "-o", path, "--cluster", cluster)
-    assert result.exit_code == 0, result.output
-    assert "recall     1.000" in result.stdout
-    return [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()]
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory):
-    """A set of BOP, and what is found without a cluster."""
-    folder = tmp_path_factory.mktemp("sets")
-    root = tiny_sets.bop(folder / "tiny")
-    assert run("bop", root, "-o", folder / "a.csv", "--jobs", 1).exit_code == 0
-    return root, [line.rsplit(",", 1)[0] for line in (folder / "a.csv").read_text().splitlines()]
-
-
-def test_a_set_of_bop_is_found_on_dask(dask_client, tiny, tmp_path):
-    root, wanted = tiny
-    assert bop_on(dask_client.scheduler.address, root, tmp_path / "a.csv") == wanted
-
-
 def test_a_dask_client_is_no_executor(dask_client):
     with pytest.raises(TypeError, match=r"of Dask client.get_executor\(\)"):
         ibi.register_batch(JOBS, dask_client)
@@ -214,31 +190,6 @@ def test_ray_drops_what_waits_when_a_batch_is_closed(ray):
     assert content(next(found)) == EXPECTED[0]
     found.close()
     assert executor.submit(int, "3").result(LIMIT_S) == 3
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # its own
-def test_ray_data_loses_no_scan_with_a_worker(ray, scans, tmp_path):
-    data = pytest.importorskip("ray.data", reason="Ray Data needs pandas and pyarrow")
-    data.DataContext.get_current().enable_progress_bars = False
-    rows, poses = scans
-    found = (
-        data.from_items(rows, override_num_blocks=NUM_SCANS // 8)
-        .map_batches(
-            DeadlyDetector,
-            fn_constructor_args=(str(tmp_path / "was here"),),
-            batch_size=8,
-            concurrency=2,
-            num_cpus=0.5,  # of two: the readers want one
-        )
-        .take_all()
-    )
-    assert (tmp_path / "was here").exists()
-    check(found, poses)
-
-
-def test_a_set_of_bop_is_found_on_ray(ray, tiny, tmp_path):
-    root, wanted = tiny
-    assert bop_on("ray", root, tmp_path / "a.csv") == wanted
 
 
 # Neither -------------------------------------------------------------------------------------------------
