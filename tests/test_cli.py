@@ -52,6 +52,38 @@ def test_a_mesh_and_a_scan_give_a_table_and_files(found):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def shifts(path):
+    with path.open(newline="") as file:
+        return np.array([np.fromstring(row["t"], sep=" ") for row in csv.DictReader(file)])
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"), [(1000, ()), (100, ("--unit", "cm")), (1 / 0.0254, ("--unit", "inch"))]
+)
+def test_the_csv_is_in_millimetres_whatever_the_unit(found, tmp_path, scale, unit):
+    part, scan = trimesh.load(MESH), ibi.io.read_cloud(SCAN)[0]
+    trimesh.Trimesh(part.vertices * scale, part.faces, process=False).export(tmp_path / "part.ply")
+    np.save(tmp_path / "scan.npy", scan * scale)
+    for words in (("register", "part.ply", "scan.npy"), ("batch", "part.ply", "scan.npy")):
+        files = [tmp_path / word if "." in word else word for word in words]
+        result = run(*files, "--bop", tmp_path / "a.csv", "--viewpoint", "0,0,0", *unit)
+        assert result.exit_code == 0, result.output
+        wanted, told = shifts(found[1][1]), shifts(tmp_path / "a.csv")
+        assert len(told) == len(wanted)
+        assert all(np.linalg.norm(wanted - one, axis=1).min() < 2 for one in told)
+
+
+def test_a_unit_that_cannot_be_told_is_asked_for(tmp_path):
+    part = trimesh.load(MESH)
+    trimesh.Trimesh(part.vertices * 50, part.faces, process=False).export(tmp_path / "part.ply")
+    result = run("register", tmp_path / "part.ply", SCAN, "--bop", tmp_path / "a.csv")
+    assert result.exit_code == 2
+    assert "may be in mm or m; say --unit" in result.stderr
+    result = run("register", MESH, SCAN, "--bop", tmp_path / "a.csv", "--unit", "ell")
+    assert result.exit_code == 2
+    assert "--unit ell: there are mm, cm, m, inch" in result.stderr
+
+
 def test_eval_scores_what_register_wrote(found, tmp_path):
     _, (poses, *_) = found
     with np.load(TEE / "tee6.npz") as file:

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import ibi_rs as ibi
+import numpy as np
 import pytest
 from test_batch import EXPECTED, JOBS, MODEL, SCENES, content, values
+from test_detector import MODEL as BOX_MODEL
+from test_detector import batch
 from test_process import LIMIT_S
 
 NO_CLUSTERS = "large, so not in the group of the tests: `make test-clusters` installs it and has these run"
@@ -29,6 +32,44 @@ class Deadly(ibi.Job):
 
 def deadly(name):
     return Deadly(MODEL, SCENES[0].tgt, SCENES[0].corr, name=str(name))
+
+
+class DeadlyDetector(ibi.Detector):
+    """Kills its worker over scan 50, until the file exists that it is named by."""
+
+    def __init__(self, name):
+        super().__init__(BOX_MODEL, max_instances=1)
+        self.name = name
+
+    def __call__(self, batch):
+        if 50 in list(batch["scan_id"]) and not os.path.exists(self.name):
+            Path(self.name).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().__call__(batch)
+
+
+NUM_SCANS = 200
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """As many as there are of ten kinds, each with the pose that is found."""
+    held = batch(range(10))
+    found = ibi.Detector(BOX_MODEL, max_instances=1)(held)["target_from_source"]
+    assert len(found) == 10
+    rows = [
+        {"scan_id": i, "points": held["points"][i % 10].ravel(), "viewpoint": np.zeros(3)}
+        for i in range(NUM_SCANS)
+    ]
+    return rows, found
+
+
+def check(found, poses):
+    """None is lost, none is told twice, and each is what it is without a cluster."""
+    order = np.argsort([row["scan_id"] for row in found])
+    assert [int(found[i]["scan_id"]) for i in order] == list(range(NUM_SCANS))
+    for i, row in enumerate(order):
+        np.testing.assert_array_equal(np.asarray(found[row]["target_from_source"]), poses[i % 10])
 
 
 # Dask ----------------------------------------------------------------------------------------------------
@@ -85,6 +126,24 @@ def test_dask_drops_what_waits_when_a_batch_is_closed(dask_client):
     while any(dask_client.processing().values()) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not any(dask_client.processing().values())
+
+
+def by_rows(detect, rows):
+    """A partition of a bag, as a dict of columns and back."""
+    rows = list(rows)
+    found = detect({name: [row[name] for row in rows] for name in rows[0]})
+    return [dict(zip(found, values, strict=True)) for values in zip(*found.values(), strict=True)]
+
+
+def test_a_dask_bag_loses_no_scan_with_a_worker(dask_client, scans, tmp_path):
+    import dask.bag
+
+    rows, poses = scans
+    detect = DeadlyDetector(str(tmp_path / "was here"))
+    bag = dask.bag.from_sequence(rows, partition_size=8)
+    found = bag.map_partitions(lambda part: by_rows(detect, part)).compute()
+    assert (tmp_path / "was here").exists()
+    check(found, poses)
 
 
 def test_a_dask_client_is_no_executor(dask_client):

@@ -39,8 +39,8 @@ def test_examples_in_docstrings_print_what_they_say(name):
 
 
 def public():
-    """What the six namespaces export, each with its name."""
-    for module in (ibi, ibi.features, ibi.metrics, ibi.stages, ibi.synth, ibi.viz):
+    """What the seven namespaces export, each with its name."""
+    for module in (ibi, ibi.datasets, ibi.features, ibi.metrics, ibi.stages, ibi.synth, ibi.viz):
         for name in module.__all__:
             thing = getattr(module, name)
             if inspect.isfunction(thing) or inspect.isclass(thing):
@@ -139,7 +139,7 @@ def beside_examples(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/stages.md", "docs/batch.md"])
+@pytest.mark.parametrize("name", ["README.md", "docs/stages.md", "docs/batch.md", "docs/datasets.md"])
 def test_a_page_runs(name, beside_examples):
     text = (ROOT / name).read_text(encoding="utf-8")
     assert blocks(text), f"{name} shows no Python"

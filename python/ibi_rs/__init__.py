@@ -3,10 +3,11 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import features, io, metrics, plot, stages, synth, viz
+from ibi_rs import datasets, features, io, metrics, plot, stages, synth, viz
 from ibi_rs._batch import register_batch
 from ibi_rs._box import Box
 from ibi_rs._core import InputError, ParamsError, __version__
+from ibi_rs._detector import Detector
 from ibi_rs._job import Job, JobError
 from ibi_rs._match import match
 from ibi_rs._matches import Matches
@@ -48,6 +49,7 @@ from ibi_rs.variants import (
 
 __all__ = [
     "Box",
+    "Detector",
     "Evidence",
     "FreeMotion",
     "Gsac",
@@ -84,6 +86,7 @@ __all__ = [
     "View",
     "Voting",
     "__version__",
+    "datasets",
     "detect",
     "features",
     "find_symmetries",

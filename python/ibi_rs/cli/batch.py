@@ -22,6 +22,7 @@ from ibi_rs._files import read_json, try_writing
 
 from .outputs import (
     as_dict,
+    millimetres,
     print_table,
     sha256,
     try_outputs,
@@ -39,6 +40,7 @@ from .search import (
     Search,
     SymmetriesOf,
     TimeoutS,
+    Unit,
     Viewpoint,
     Voxel,
     chosen_params,
@@ -81,9 +83,8 @@ def batch(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the poses: a JSON for each scan.")
     ] = None,
-    bop: Annotated[
-        Path | None, typer.Option(help="All poses as BOP's CSV: t in mm, if the unit is the metre.")
-    ] = None,
+    bop: Annotated[Path | None, typer.Option(help="All poses as BOP's CSV: t in mm.")] = None,
+    unit: Unit = None,
     obj_id: Annotated[int, typer.Option(min=0, help="obj_id in the CSV.")] = 1,
     skip_existing: Annotated[
         bool,
@@ -127,6 +128,7 @@ def batch(
     )
     _try_folder(output, targets)
     part = search.model(model, None)
+    mm = 0.0 if bop is None else millimetres(unit, part.diameter)
     of_model: dict[str, Any] = {"model": model, "model_sha256": sha256(model)}
     recorded = search.recorded(part.symmetries)
     outcomes: dict[int, _Outcome] = {}
@@ -164,7 +166,7 @@ def batch(
     _show_batch(scenes, outcomes, time.perf_counter() - start)
     if bop is not None:
         ids = _bop_ids(scenes)
-        write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id)
+        write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id, mm=mm)
     if any(one.has_failed for one in outcomes.values()):
         raise typer.Exit(1)
 

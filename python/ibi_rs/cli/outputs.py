@@ -150,14 +150,36 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def write_bop(path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], *obj_ids: int) -> None:
-    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds; an obj_id each."""
+MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+
+
+def millimetres(unit: str | None, *diameters: float) -> float:
+    """Return how many millimetres the unit of the data has: as it is said, or by the size of the parts."""
+    if unit is not None:
+        if unit not in MM:
+            misused(f"--unit {unit}: there are {', '.join(MM)}")
+        return MM[unit]
+    if max(diameters) < 1:  # one of a millimetre would be a grain
+        return MM["m"]
+    if min(diameters) > 10:  # one of ten metres is no part
+        return MM["mm"]
+    sizes = ", ".join(f"{one:.4g}" for one in diameters)
+    misused(f"--bop writes millimetres, and a part {sizes} across may be in mm or m; say --unit")
+
+
+def write_bop(
+    path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], *obj_ids: int, mm: float
+) -> None:
+    """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds; an obj_id each.
+
+    ``mm`` is how many millimetres the unit of the poses has.
+    """
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["scene_id", "im_id", "obj_id", "score", "R", "t", "time"])
         obj_ids = obj_ids if len(obj_ids) == len(images) else (obj_ids or (1,)) * len(images)
         for obj_id, (scene_id, im_id, poses, scores, seconds) in zip(obj_ids, images, strict=True):
             for pose, score in zip(poses, scores, strict=True):
-                parts = pose[:3, :3], 1000 * pose[:3, 3]
+                parts = pose[:3, :3], mm * pose[:3, 3]
                 numbers = (" ".join(f"{x:.9g}" for x in part.ravel()) for part in parts)
                 rows.writerow([scene_id, im_id, obj_id, f"{score:.6f}", *numbers, f"{seconds:.4f}"])

@@ -10,11 +10,12 @@ import numpy as np
 import typer
 
 import ibi_rs as ibi
-from ibi_rs import io
+from ibi_rs import io, metrics
 from ibi_rs._files import read_npy
 
 from .outputs import (
     as_dict,
+    millimetres,
     sha256,
     show,
     try_outputs,
@@ -33,6 +34,7 @@ from .search import (
     Search,
     SymmetriesOf,
     TimeoutS,
+    Unit,
     Viewpoint,
     Voxel,
     chosen_params,
@@ -73,9 +75,8 @@ def register(
         int | None, typer.Option(min=1, max=MAX_THREADS, help="Default: all that the process may use.")
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON.")] = None,
-    bop: Annotated[
-        Path | None, typer.Option(help="Poses as BOP's CSV: t in mm, if the unit is the metre.")
-    ] = None,
+    bop: Annotated[Path | None, typer.Option(help="Poses as BOP's CSV: t in mm.")] = None,
+    unit: Unit = None,
     plot: Annotated[
         Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
     ] = None,
@@ -123,12 +124,14 @@ def register(
         if corr is not None:
             tgt, tgt_normals = io.read_cloud(scene)
             pairs = _pairs(corr)
+            mm = 0.0 if bop is None else millimetres(unit, metrics.diameter(io.read_cloud(model)[0]))
             src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
         else:
             scan = io.read_scan(scene)
             tgt, sight = scan.points, search.sight(scan.normals, scan.viewpoint)
             parts = [search.model(one, threads) for one in models]
             part = parts[0]
+            mm = 0.0 if bop is None else millimetres(unit, *(one.diameter for one in parts))
             src, held = part.points, part.symmetries
             status.update("detecting")
             kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
@@ -162,7 +165,7 @@ def register(
     if bop is not None:
         of_parts = [found.of(i) for i in range(len(models))]
         rows = [(0, 0, np.asarray(one), [pose.score for pose in one], seconds) for one in of_parts]
-        write_bop(bop, rows, *range(1, len(models) + 1))
+        write_bop(bop, rows, *range(1, len(models) + 1), mm=mm)
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes

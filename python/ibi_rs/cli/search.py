@@ -76,6 +76,13 @@ SymmetriesOf = Annotated[
 Preset = Annotated[str | None, typer.Option(help=f"{', '.join(PRESETS)}; by default what fits the scene.")]
 ParamsFile = Annotated[Path | None, typer.Option(help="Parameters as TOML or JSON.")]
 MaxInstances = Annotated[int | None, typer.Option(min=1, max=2**32 - 1, help="No more than so many.")]
+Unit = Annotated[
+    str | None,
+    typer.Option(
+        help="Unit of the data, for the millimetres of --bop: mm, cm, m, inch. "
+        "Default: m for parts below 1 across, mm above 10."
+    ),
+]
 TimeoutS = Annotated[float | None, typer.Option(help="Seconds, then what was found is kept.")]
 
 

@@ -126,8 +126,9 @@ def off_lines(path: Path) -> list[list[str]]:
     text = path.read_text(encoding="utf-8", errors="replace")
     words = [line.split("#")[0].split() for line in text.splitlines()]
     words = [line for line in words if line]
-    if words and words[0][0].upper().endswith("OFF"):
-        words[0] = words[0][1:]
+    head = re.match(r"[A-Za-z0-9]*OFF", words[0][0], re.IGNORECASE) if words else None
+    if head:  # in some files of ModelNet the counts follow at once: OFF490 518 0
+        words[0] = [word for word in (words[0][0][head.end() :], *words[0][1:]) if word]
         words = words if words[0] else words[1:]
     return words
 
