@@ -39,8 +39,8 @@ def test_examples_in_docstrings_print_what_they_say(name):
 
 
 def public():
-    """What the six namespaces export, each with its name."""
-    for module in (ibi, ibi.features, ibi.metrics, ibi.stages, ibi.synth, ibi.viz):
+    """What the seven namespaces export, each with its name."""
+    for module in (ibi, ibi.features, ibi.metrics, ibi.ros, ibi.stages, ibi.synth, ibi.viz):
         for name in module.__all__:
             thing = getattr(module, name)
             if inspect.isfunction(thing) or inspect.isclass(thing):

@@ -32,16 +32,20 @@ from .search import (
     Crop,
     FromAllSides,
     MaxInstances,
+    MinScore,
     ModelFile,
     ParamsFile,
     Preset,
     RemovePlane,
     Search,
+    Set,
     SymmetriesOf,
     TimeoutS,
+    Unit,
     Viewpoint,
     Voxel,
-    chosen_params,
+    changes_of,
+    unit_of,
 )
 from .terminal import (
     MAX_THREADS,
@@ -69,6 +73,9 @@ def batch(
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
+    settings: Set = None,
+    min_score: MinScore = None,
+    unit: Unit = None,
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
     jobs: Annotated[
@@ -82,7 +89,7 @@ def batch(
         Path | None, typer.Option("-o", "--output", help="Folder for the poses: a JSON for each scan.")
     ] = None,
     bop: Annotated[
-        Path | None, typer.Option(help="All poses as BOP's CSV: t in mm, if the unit is the metre.")
+        Path | None, typer.Option(help="All poses as BOP's CSV: t in mm, by --unit, else as if it were m.")
     ] = None,
     obj_id: Annotated[int, typer.Option(min=0, help="obj_id in the CSV.")] = 1,
     skip_existing: Annotated[
@@ -116,9 +123,19 @@ def batch(
     """
     if skip_existing and output is None:
         misused("--skip-existing looks into the folder of -o; give it")
-    chosen = chosen_params(preset, params)
+    unit = unit_of(unit)
+    changes = changes_of(preset, params, settings)
     search = Search(
-        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries, crop
+        viewpoint,
+        from_all_sides,
+        voxel,
+        remove_plane,
+        changes,
+        max_instances,
+        timeout_s,
+        symmetries,
+        crop,
+        min_score,
     )
     start = time.perf_counter()
     targets = _targets(scenes, output)
@@ -136,19 +153,23 @@ def batch(
     new = [i for i in range(len(scenes)) if i not in outcomes]
     # Without a viewpoint a job takes the normals of its file.
     options = [search.sight(None, _place(scenes[i])) | search.limits(None) for i in new]
-    todo = [_TimedJob(part, scenes[i], params=chosen, **own) for i, own in zip(new, options, strict=True)]
+    todo = [
+        _TimedJob(part, scenes[i], params=search.params, **own) for i, own in zip(new, options, strict=True)
+    ]
 
     def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
         i, job = new[number], todo[number]
         if not isinstance(found, ibi.JobError):
-            found = found if part.symmetries.is_none else found.canonical(part.symmetries)
+            found = search.kept(found)
             for warning in found.warnings:
                 warn(f"{scenes[i]}: {warning}")
         outcome = _outcome(job, found)
         target = targets[i]
         if target is not None and not isinstance(found, ibi.JobError):
             of_scene: dict[str, Any] = {"scene": scenes[i], "scene_sha256": job.sha256[-1]}
-            write_json(target, as_dict(found, outcome.seconds, **of_model, **of_scene, search=recorded))
+            write_json(
+                target, as_dict(found, outcome.seconds, **of_model, **of_scene, search=recorded, unit=unit)
+            )
         outcomes[i] = outcome
 
     try:
@@ -164,7 +185,7 @@ def batch(
     _show_batch(scenes, outcomes, time.perf_counter() - start)
     if bop is not None:
         ids = _bop_ids(scenes)
-        write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id)
+        write_bop(bop, [(*ids[i], *outcomes[i].row()) for i in range(len(scenes))], obj_id, unit=unit)
     if any(one.has_failed for one in outcomes.values()):
         raise typer.Exit(1)
 

@@ -18,6 +18,7 @@ from rich.table import Table
 import ibi_rs as ibi
 from ibi_rs._files import try_writing, written
 from ibi_rs._numbers import lengths
+from ibi_rs._written import METRES, quaternion
 
 from .terminal import Printer, misused, out
 
@@ -80,15 +81,9 @@ def print_table(table: Table) -> None:
 
 def _rotation_vector(rotation: Any) -> Any:
     """Axis times angle, by the quaternion: exact for half turns, too."""
-    four = np.empty((4, 4))  # 4 q qT, whose rows are all the quaternion q, (w, x, y, z), times something
-    four[0, 0] = 1 + np.trace(rotation)
-    off = rotation - rotation.T
-    four[0, 1:] = four[1:, 0] = off[2, 1], off[0, 2], off[1, 0]
-    four[1:, 1:] = rotation + rotation.T + (1 - np.trace(rotation)) * np.eye(3)
-    quaternion = four[np.argmax(np.diag(four))]
-    quaternion = quaternion / np.linalg.norm(quaternion) * np.copysign(1, quaternion[0])
-    sine = float(np.linalg.norm(quaternion[1:]))
-    return quaternion[1:] * (2 * np.arctan2(sine, quaternion[0]) / max(sine, 1e-300))
+    *axis, cosine = quaternion(rotation)
+    sine = float(np.linalg.norm(axis))
+    return np.array(axis) * (2 * np.arctan2(sine, cosine) / max(sine, 1e-300))
 
 
 def sha256(path: Path) -> str:
@@ -109,39 +104,18 @@ def as_dict(
     scene: Path,
     scene_sha256: str,
     search: dict[str, Any],
+    unit: str | None = None,
 ) -> dict[str, Any]:
     """Bring the poses into the form of the JSON files, with all that they depend on."""
     return {
-        "ibi_rs": ibi.__version__,
+        **found.to_dict(unit=unit, run=False),
         "model": str(model) if isinstance(model, Path) else list(map(str, model)),
         "model_sha256": model_sha256,
         "scene": str(scene),
         "scene_sha256": scene_sha256,
         "search": search,
-        "poses": [
-            {
-                **(_part(pose) if len(found.models) > 1 else {}),
-                "target_from_source": pose.target_from_source.tolist(),
-                "score": pose.score,
-                "overlap": pose.overlap,
-                "num_inliers": pose.num_inliers,
-                "inlier_rmse": pose.inlier_rmse,
-                "centre": pose.centre.tolist(),
-                "covariance": None if pose.covariance is None else pose.covariance.tolist(),
-                "free_motions": [free.to_dict() for free in pose.free_motions],
-            }
-            for pose in found
-        ],
-        "warnings": list(found.warnings),
-        "stop_reason": str(found.stop_reason),
         "seconds": round(seconds, 4),
-        "resolution": found.resolution,
-        "params": found.params.to_dict(),
     }
-
-
-def _part(pose: ibi.Pose) -> dict[str, Any]:
-    return {"model": pose.model, "model_name": pose.model_name}
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:
@@ -150,14 +124,20 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def write_bop(path: Path, images: Sequence[tuple[int, int, Any, list[float], float]], *obj_ids: int) -> None:
+def write_bop(
+    path: Path,
+    images: Sequence[tuple[int, int, Any, list[float], float]],
+    *obj_ids: int,
+    unit: str | None = None,
+) -> None:
     """Rows of images: scene_id, im_id, (K, 4, 4) poses, their scores, and seconds; an obj_id each."""
+    mm = 1000 * METRES[unit or "m"]
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["scene_id", "im_id", "obj_id", "score", "R", "t", "time"])
         obj_ids = obj_ids if len(obj_ids) == len(images) else (obj_ids or (1,)) * len(images)
         for obj_id, (scene_id, im_id, poses, scores, seconds) in zip(obj_ids, images, strict=True):
             for pose, score in zip(poses, scores, strict=True):
-                parts = pose[:3, :3], 1000 * pose[:3, 3]
+                parts = pose[:3, :3], mm * pose[:3, 3]
                 numbers = (" ".join(f"{x:.9g}" for x in part.ravel()) for part in parts)
                 rows.writerow([scene_id, im_id, obj_id, f"{score:.6f}", *numbers, f"{seconds:.4f}"])

@@ -25,18 +25,22 @@ from .search import (
     Crop,
     FromAllSides,
     MaxInstances,
+    MinScore,
     ModelFiles,
     ParamsFile,
     Preset,
     RemovePlane,
     SceneFile,
     Search,
+    Set,
     SymmetriesOf,
     TimeoutS,
+    Unit,
     Viewpoint,
     Voxel,
-    chosen_params,
+    changes_of,
     symmetries_of,
+    unit_of,
 )
 from .terminal import (
     FOUND_NOTHING,
@@ -67,14 +71,17 @@ def register(
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
+    settings: Set = None,
+    min_score: MinScore = None,
+    unit: Unit = None,
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
     threads: Annotated[
         int | None, typer.Option(min=1, max=MAX_THREADS, help="Default: all that the process may use.")
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON, or as .csv.")] = None,
     bop: Annotated[
-        Path | None, typer.Option(help="Poses as BOP's CSV: t in mm, if the unit is the metre.")
+        Path | None, typer.Option(help="Poses as BOP's CSV: t in mm, by --unit, else as if it were m.")
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
@@ -110,9 +117,19 @@ def register(
         misused("--corr brings the matches: --crop has no say then")
     if len(models) > 1:
         _try_several(corr, plot, rerun, symmetries)
-    chosen = chosen_params(preset, params)
+    unit = unit_of(unit)
+    changes = changes_of(preset, params, settings)
     search = Search(
-        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries, crop
+        viewpoint,
+        from_all_sides,
+        voxel,
+        remove_plane,
+        changes,
+        max_instances,
+        timeout_s,
+        symmetries,
+        crop,
+        min_score,
     )
     outputs = {"--output": output, "--bop": bop, "--plot": plot, "--rerun": rerun}
     inputs = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
@@ -134,15 +151,14 @@ def register(
             kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
             found = kinds.detect(
                 tgt,
-                chosen,
+                search.params,
                 **sight,
                 callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
                 **options,
             )
     seconds = time.perf_counter() - start
+    found = search.kept(found)
     of_all = [held] if corr is not None else [one.symmetries for one in parts]
-    if not all(one.is_none for one in of_all):
-        found = found.canonical(of_all)
     for warning in found.warnings:
         warn(warning)
     show(found, seconds)
@@ -158,11 +174,14 @@ def register(
             "scene_sha256": sha256(scene),
         }
         recorded = search.recorded(*of_all) | ({} if corr is None else {"corr": str(corr)})
-        write_json(output, as_dict(found, seconds, **files, search=recorded))
+        if output.suffix.lower() == ".csv":
+            found.save(output)
+        else:
+            write_json(output, as_dict(found, seconds, **files, search=recorded, unit=unit))
     if bop is not None:
         of_parts = [found.of(i) for i in range(len(models))]
         rows = [(0, 0, np.asarray(one), [pose.score for pose in one], seconds) for one in of_parts]
-        write_bop(bop, rows, *range(1, len(models) + 1))
+        write_bop(bop, rows, *range(1, len(models) + 1), unit=unit)
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes
@@ -208,12 +227,12 @@ def _with_matches(
         if search.viewpoint is not None:
             warn("--viewpoint has no say where MODEL or SCENE has no normals")
     # A scan's camera is at its origin unless it is said to be elsewhere; but is this a scan?
-    is_scan = search.viewpoint is not None or (search.params is not None and search.params.oriented_normals)
+    is_scan = search.viewpoint is not None or search.changes.on(ibi.Params()).oriented_normals
     has_eye = tgt_normals is not None and is_scan
     found = ibi.Model(src, normals=src_normals, symmetries=held).register(
         tgt,
         pairs,
-        search.params or (ibi.Params.single_view() if has_eye else ibi.Params()),
+        search.changes.on(ibi.Params.single_view() if has_eye else ibi.Params()),
         tgt_normals=tgt_normals,
         viewpoint=(search.viewpoint or (0.0, 0.0, 0.0)) if has_eye else None,
         **options,

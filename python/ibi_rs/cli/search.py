@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 import typer
 
 import ibi_rs as ibi
 from ibi_rs import io, metrics
+from ibi_rs import params as parameters
 from ibi_rs._inputs import _num_threads
+from ibi_rs._written import METRES, checked_unit
 from ibi_rs.symmetries import _bop_entry as bop_entry
 
 from .terminal import misused
 
 SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has several objects"
 
-PRESETS = {
-    "default": ibi.Params,
-    "single_view": ibi.Params.single_view,
-    "many_views": ibi.Params.many_views,
-    "paper_synthetic": ibi.Params.paper_synthetic,
-    "paper_real": ibi.Params.paper_real,
-}
+PRESETS = get_args(parameters.Preset)
 
 ModelFile = Annotated[
     Path, typer.Argument(help="Mesh of the part: STL, PLY, OBJ, OFF or GLB.", metavar="MODEL")
@@ -74,9 +71,89 @@ SymmetriesOf = Annotated[
     str, typer.Option(help=f"{SYMMETRIES}. Of poses that look the same the one turned least is given.")
 ]
 Preset = Annotated[str | None, typer.Option(help=f"{', '.join(PRESETS)}; by default what fits the scene.")]
-ParamsFile = Annotated[Path | None, typer.Option(help="Parameters as TOML or JSON.")]
+ParamsFile = Annotated[
+    Path | None,
+    typer.Option(help="Parameters as TOML or JSON. What FILE leaves out is of its base, else of the preset."),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", help="One parameter, as hv.t_score=0.97 or te=mac; may be given again.", metavar="NAME=VALUE"
+    ),
+]
+MinScore = Annotated[
+    float | None, typer.Option(min=0, max=1, help="Leave out poses that are right with a lower probability.")
+]
+Unit = Annotated[
+    str | None,
+    typer.Option(
+        help=f"What MODEL and the scan are in: {', '.join(METRES)}. Noted in the JSON; BOP's CSV needs it."
+    ),
+]
 MaxInstances = Annotated[int | None, typer.Option(min=1, max=2**32 - 1, help="No more than so many.")]
 TimeoutS = Annotated[float | None, typer.Option(help="Seconds, then what was found is kept.")]
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What the options say of parameters; of the rest the scene decides."""
+
+    preset: str | None
+    path: Path | None
+    settings: dict[str, Any]
+
+    @property
+    def is_any(self) -> bool:
+        """Whether the options say anything."""
+        return self.preset is not None or self.path is not None or bool(self.settings)
+
+    def on(self, fitting: ibi.Params) -> ibi.Params:
+        """Lay the file over the preset, or over what fits the scene, and single values over that."""
+        params = fitting if self.preset is None else ibi.Params.preset(self.preset)  # type: ignore[arg-type]
+        if self.path is not None:
+            params = ibi.Params.load(self.path, base=params)
+        try:
+            return params.replace(**self.settings)
+        except (ibi.ParamsError, TypeError) as error:
+            misused(f"--set: {error}")
+
+
+def unit_of(unit: str | None) -> str | None:
+    """See that a unit has a name."""
+    try:
+        return checked_unit(unit)
+    except ibi.InputError as error:
+        misused(f"--unit: {error}")
+
+
+def changes_of(preset: str | None, path: Path | None, settings: list[str] | None) -> Changes:
+    """Read what the options say of parameters, and see that they can be used."""
+    if preset is not None and preset not in PRESETS:
+        misused(f"--preset {preset}: there are {', '.join(PRESETS)}")
+    values = {}
+    for setting in settings or ():
+        name, equals, text = setting.partition("=")
+        if not equals or not name.strip() or not text.strip():
+            misused(f"--set {setting}: must be NAME=VALUE, as hv.t_score=0.97")
+        if name.strip() not in {*parameters._HINTS, *parameters._STAGES, *VARIANTS}:
+            misused(f"--set {setting}: there is no parameter {name.strip()!r}")
+        values[name.strip()] = _value(text.strip())
+    changes = Changes(preset, path, parameters._with_nulls(values))
+    changes.on(ibi.Params())
+    return changes
+
+
+VARIANTS = {f"{stage}.variant" for stage in parameters._STAGES}
+
+
+def _value(text: str) -> Any:
+    """Read a number, true, false or a word."""
+    for read in (int, float):
+        try:
+            return read(text)
+        except ValueError:
+            pass
+    return {"true": True, "false": False}.get(text.lower(), text)
 
 
 @dataclass(frozen=True)
@@ -87,11 +164,12 @@ class Search:
     from_all_sides: bool
     voxel: float | None
     remove_plane: bool | None
-    params: ibi.Params | None
+    changes: Changes
     max_instances: int | None
     timeout_s: float | None
     symmetries: str = "none"
     crop: tuple[float, ...] | None = None
+    min_score: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse now what would be refused once the files are read."""
@@ -127,13 +205,23 @@ class Search:
             "roi": None if self.crop is None else np.reshape(self.crop, (2, 3)),
         }
 
-    def params_for(self, default: ibi.Params | None = None) -> ibi.Params:
-        """Return those that a run will have: the chosen ones, or those that fit the scene, and the limits."""
-        if default is None:
-            default = ibi.Params.many_views() if self.from_all_sides else ibi.Params.single_view()
+    @cached_property
+    def params(self) -> ibi.Params | None:
+        """The parameters of a detection; None: what fits the scene, as it is."""
+        if not self.changes.is_any:
+            return None
+        return self.changes.on(ibi.Params.many_views() if self.from_all_sides else ibi.Params.single_view())
+
+    def params_for(self) -> ibi.Params:
+        """Return those that a detection will have: chosen, or what fits the scene, and the limits."""
+        default = ibi.Params.many_views() if self.from_all_sides else ibi.Params.single_view()
         limits = {"max_instances": self.max_instances, "timeout_s": self.timeout_s}
         given = {name: value for name, value in limits.items() if value is not None}
         return (self.params or default).replace(**given)
+
+    def kept(self, found: ibi.Registration) -> ibi.Registration:
+        """Leave out what has too low a score."""
+        return found if self.min_score is None else found.at_least(self.min_score)
 
     def recorded(self, *symmetries: ibi.Symmetries) -> dict[str, Any]:
         """Return what a result depends on beside the parameters and the files, for the JSON."""
@@ -145,6 +233,7 @@ class Search:
             "remove_plane": self.remove_plane,
             "symmetries": of[0] if len(of) == 1 else of,
             "crop": None if self.crop is None else list(self.crop),
+            "min_score": self.min_score,
         }
 
     def limits(self, num_threads: int | None) -> dict[str, Any]:
@@ -181,14 +270,3 @@ def symmetries_of(given: str, points: Any, normals: Any = None) -> ibi.Symmetrie
         return ibi.Symmetries.from_bop(entry, scale=scale)
     except (ValueError, TypeError) as error:
         raise ibi.InputError(f"{path}: {error}") from error
-
-
-def chosen_params(preset: str | None, path: Path | None) -> ibi.Params | None:
-    """Read the parameters of a preset or a file; None where neither is given."""
-    if preset is not None and path is not None:
-        misused("give --preset or --params, not both")
-    if preset is not None:
-        if preset not in PRESETS:
-            misused(f"--preset {preset}: there are {', '.join(PRESETS)}")
-        return PRESETS[preset]()
-    return None if path is None else ibi.Params.load(path)
