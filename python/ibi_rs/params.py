@@ -251,7 +251,7 @@ class Params:
             if stage in changes:  # te="mac" beside "te.t_cmp"
                 block = {"variant": getattr(changes[stage], "variant", changes[stage])} | block
                 if dataclasses.is_dataclass(changes[stage]):
-                    block = dataclasses.asdict(changes[stage]) | block  # type: ignore[arg-type]
+                    block = dataclasses.asdict(changes[stage]) | block
             held = None if _is_own(getattr(self, stage)) else self._built_in()[stage]
             data = {stage: _laid(stage, held, block)}
             changes[stage] = _build(json.loads(_core.check_params(_dumps(data))))[stage]

@@ -29,7 +29,9 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    CameraOf,
     Crop,
+    DepthScale,
     FromAllSides,
     MaxInstances,
     MinScore,
@@ -37,6 +39,7 @@ from .search import (
     ParamsFile,
     Preset,
     RemovePlane,
+    RemovePlanes,
     Search,
     Set,
     SymmetriesOf,
@@ -65,10 +68,13 @@ def batch(
         list[Path],
         typer.Argument(help="Scans, of any kind that `register` reads.", metavar="SCENES"),
     ],
+    camera: CameraOf = None,
+    depth_scale: DepthScale = None,
     viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    remove_planes: RemovePlanes = None,
     crop: Crop = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
@@ -136,6 +142,10 @@ def batch(
         symmetries,
         crop,
         min_score,
+        camera,
+        depth_scale,
+        remove_planes,
+        unit,
     )
     start = time.perf_counter()
     targets = _targets(scenes, output)
@@ -153,8 +163,11 @@ def batch(
     new = [i for i in range(len(scenes)) if i not in outcomes]
     # Without a viewpoint a job takes the normals of its file.
     options = [search.sight(None, _place(scenes[i])) | search.limits(None) for i in new]
+    # Of an image, or without planes, all is made where the job runs.
+    by = search if camera is not None or remove_planes is not None else None
     todo = [
-        _TimedJob(part, scenes[i], params=search.params, **own) for i, own in zip(new, options, strict=True)
+        _TimedJob(part, scenes[i], params=search.params, search=by, **own)
+        for i, own in zip(new, options, strict=True)
     ]
 
     def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
@@ -204,12 +217,18 @@ class _TimedJob(ibi.Job):
 
     seconds: list[float] = field(default_factory=list, kw_only=True)
     sha256: list[str] = field(default_factory=list, kw_only=True)
+    search: Search | None = field(default=None, kw_only=True)
 
     def run(self, **options: Any) -> ibi.Registration:
         start = time.perf_counter()
-        found = super().run(**options)
-        self.seconds.append(time.perf_counter() - start)
         assert self.path is not None
+        if self.search is None:
+            found = super().run(**options)
+        else:
+            tgt, sight = self.search.look(self.search.read(self.path), self.model.voxel)
+            num_threads = options.pop("num_threads", None)
+            found = self.model.detect(tgt, self.params, **sight, **self.search.limits(num_threads), **options)
+        self.seconds.append(time.perf_counter() - start)
         self.sha256.append(sha256(self.path))
         return found
 

@@ -22,7 +22,9 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    CameraOf,
     Crop,
+    DepthScale,
     FromAllSides,
     MaxInstances,
     MinScore,
@@ -30,6 +32,7 @@ from .search import (
     ParamsFile,
     Preset,
     RemovePlane,
+    RemovePlanes,
     SceneFile,
     Search,
     Set,
@@ -63,10 +66,13 @@ def register(
             help="Your own correspondences (NPY or text): pairs of rows, or of points; MODEL is a cloud then."
         ),
     ] = None,
+    camera: CameraOf = None,
+    depth_scale: DepthScale = None,
     viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    remove_planes: RemovePlanes = None,
     crop: Crop = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
@@ -99,6 +105,8 @@ def register(
 
     Several parts in one scan:     ibi register bolt.stl nut.stl scan.ply
 
+    A depth image:                 ibi register part.stl d.png --camera cam.json
+
     Of several parts each MODEL is looked for, and then all poses compete for
     what was measured. --bop numbers them from 1 in the order of the command.
 
@@ -113,8 +121,10 @@ def register(
     model = models[0]
     if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
         misused("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
-    if corr is not None and crop is not None:
-        misused("--corr brings the matches: --crop has no say then")
+    idle = {"--crop": crop, "--camera": camera, "--remove-planes": remove_planes}
+    if corr is not None and any(value is not None for value in idle.values()):
+        names = [name for name, value in idle.items() if value is not None]
+        misused(f"--corr brings the matches: {', '.join(names)} has no say then")
     if len(models) > 1:
         _try_several(corr, plot, rerun, symmetries)
     unit = unit_of(unit)
@@ -130,6 +140,10 @@ def register(
         symmetries,
         crop,
         min_score,
+        camera,
+        depth_scale,
+        remove_planes,
+        unit,
     )
     outputs = {"--output": output, "--bop": bop, "--plot": plot, "--rerun": rerun}
     inputs = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
@@ -142,10 +156,10 @@ def register(
             pairs = _pairs(corr)
             src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
         else:
-            scan = io.read_scan(scene)
-            tgt, sight = scan.points, search.sight(scan.normals, scan.viewpoint)
+            scan = search.read(scene)
             parts = [search.model(one, threads) for one in models]
             part = parts[0]
+            tgt, sight = search.look(scan, min(one.voxel for one in parts))
             src, held = part.points, part.symmetries
             status.update("detecting")
             kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
@@ -185,7 +199,7 @@ def register(
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes
-        ibi.plot.instances(tgt, src, found, plot, title=title)
+        ibi.plot.instances(tgt if corr is not None else scan.points, src, found, plot, title=title)
     if rerun is not None:
         if corr is None:  # once more, as `detect` keeps them to itself
             matches = part.correspond(tgt, **sight, num_threads=threads)

@@ -11,13 +11,14 @@ import numpy as np
 import typer
 
 import ibi_rs as ibi
-from ibi_rs import io, metrics
+from ibi_rs import features, io, metrics
 from ibi_rs import params as parameters
+from ibi_rs._files import read_npy
 from ibi_rs._inputs import _num_threads
 from ibi_rs._written import METRES, checked_unit
 from ibi_rs.symmetries import _bop_entry as bop_entry
 
-from .terminal import misused
+from .terminal import misused, warn
 
 SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has several objects"
 
@@ -49,6 +50,31 @@ Crop = Annotated[
         help="Look only into a box along the axes of SCENE: its least corner and its largest one, "
         "x0,y0,z0,x1,y1,z1 or six numbers.",
         metavar="X0 Y0 Z0 X1 Y1 Z1",
+    ),
+]
+CameraOf = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        help="SCENE is a depth image (PNG, TIFF, NPY): FX,FY,CX,CY in pixels, or a JSON file "
+        "of BOP, RealSense, Open3D or ROS.",
+        metavar="FX,FY,CX,CY|FILE",
+    ),
+]
+DepthScale = Annotated[
+    float | None,
+    typer.Option(
+        help="So many steps of a pixel of the depth image are one unit. Default: what the file of --camera "
+        "says, else a step is a millimetre, and in an image of floats the unit. See --unit.",
+    ),
+]
+RemovePlanes = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        max=20,
+        help="Take so many of the largest planes away: floor and walls of a bin. What was measured there "
+        "still tells where there is nothing. Instead of --remove-plane.",
     ),
 ]
 FromAllSides = Annotated[
@@ -118,6 +144,41 @@ class Changes:
             misused(f"--set: {error}")
 
 
+def _is_of_floats(path: Path) -> bool:
+    """Whether the pixels of an image are no integers."""
+    if path.suffix.lower() == ".npy":
+        return bool(read_npy(path).dtype.kind == "f")
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return bool(image.mode == "F")
+    except OSError:  # of which `read_depth` tells
+        return False
+
+
+def _without_planes(points: Any, voxel: float, count: int, crop: Any, eye: Any) -> Any:
+    """(N,): which points are on none of the largest planes, one after the other, of what is looked into."""
+    is_left = np.ones(len(points), bool)
+    least = 0.0
+    for _ in range(count):
+        rows = np.flatnonzero(is_left)
+        if crop is not None:
+            rows = rows[((points[rows] >= crop[:3]) & (points[rows] <= crop[3:])).all(axis=1)]
+        if len(rows) < 3:
+            break
+        thinned, _ = features.voxel_downsample(points[rows], voxel)
+        least = least or 0.1 * len(thinned)  # of all: the faces of few parts that are left are no walls
+        share = least / len(thinned)
+        if share > 1:
+            break
+        plane = features.dominant_plane(thinned, 1.5 * voxel, min_share=share, viewpoint=eye)
+        if plane is None:
+            break
+        is_left[rows] = np.abs(points[rows] @ plane.normal - plane.offset) > 1.5 * voxel
+    return is_left
+
+
 def unit_of(unit: str | None) -> str | None:
     """See that a unit has a name."""
     try:
@@ -170,9 +231,22 @@ class Search:
     symmetries: str = "none"
     crop: tuple[float, ...] | None = None
     min_score: float | None = None
+    camera: str | None = None
+    depth_scale: float | None = None
+    remove_planes: int | None = None
+    unit: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse now what would be refused once the files are read."""
+        if self.camera is None and self.depth_scale is not None:
+            misused("--depth-scale is of a depth image; give its --camera")
+        if self.depth_scale is not None and not 0 < self.depth_scale < np.inf:
+            misused(f"--depth-scale is {self.depth_scale:g}; it must be above 0 and finite")
+        if self.camera is not None and (self.from_all_sides or self.viewpoint is not None):
+            misused("--camera says where it stood, at 0,0,0: leave --viewpoint and --from-all-sides out")
+        if self.remove_plane is not None and self.remove_planes is not None:
+            misused("give --remove-planes or --remove-plane, not both")
+        _ = self._numbers  # of --camera
         if self.from_all_sides and self.viewpoint is not None:
             misused("--from-all-sides has no --viewpoint; leave one of them out")
         if self.viewpoint is not None and not np.isfinite(self.viewpoint).all():
@@ -194,6 +268,54 @@ class Search:
         return ibi.Model.from_mesh(
             *mesh, voxel=self.voxel, symmetries=wanted or "find", num_threads=num_threads
         )
+
+    @cached_property
+    def _numbers(self) -> list[float] | None:
+        """FX, FY, CX, CY; None: --camera is a file."""
+        if self.camera is None:
+            return None
+        words = self.camera.replace(",", " ").split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            return None
+        if len(numbers) != 4:
+            misused(f"--camera {self.camera}: must be four numbers, FX,FY,CX,CY, or a file")
+        return numbers
+
+    def read(self, path: Path) -> io.Scan:
+        """Read a scan, or the depth image of a camera."""
+        if self.camera is None:
+            return io.read_scan(path)
+        metres = 0.001
+        if self._numbers is not None:
+            fx, fy, cx, cy = self._numbers
+            camera = io.Camera(fx, fy, cx, cy)
+        else:
+            camera = io.read_camera(self.camera, path)
+            metres = metres if camera.metres is None else camera.metres
+            if camera.is_distorted:
+                warn(f"{self.camera}: names distortions, which are not undone; give rectified images")
+        scale = metres / METRES[self.unit or "m"] if self.depth_scale is None else 1 / self.depth_scale
+        if self.depth_scale is None and camera.metres is None and _is_of_floats(path):
+            scale = 1.0
+        points = io.read_depth(path, camera.fx, camera.fy, camera.cx, camera.cy, scale=scale)
+        return io.Scan(points, None, np.zeros(3), 0)
+
+    def look(self, scan: io.Scan, voxel: float) -> tuple[Any, dict[str, Any]]:
+        """Return the points to be searched, and the arguments of `Model.detect` that go with them."""
+        sight = self.sight(scan.normals, scan.viewpoint)
+        if self.remove_planes is None:
+            return scan.points, sight
+        is_left = _without_planes(scan.points, voxel, self.remove_planes, self.crop, sight["viewpoint"])
+        if not is_left.any():
+            raise ibi.InputError(f"--remove-planes {self.remove_planes}: nothing of the scan is left")
+        sight["remove_plane"] = False
+        if sight["viewpoint"] is not None:
+            sight["viewpoint"] = ibi.View(sight["viewpoint"], scan.points)
+        if sight["tgt_normals"] is not None:
+            sight["tgt_normals"] = sight["tgt_normals"][is_left]
+        return scan.points[is_left], sight
 
     def sight(self, normals: Any, viewpoint: Any) -> dict[str, Any]:
         """Those arguments of `Model.correspond` that `Model.detect` has, too, by what a file says."""
@@ -234,6 +356,9 @@ class Search:
             "symmetries": of[0] if len(of) == 1 else of,
             "crop": None if self.crop is None else list(self.crop),
             "min_score": self.min_score,
+            "camera": self.camera,
+            "depth_scale": self.depth_scale,
+            "remove_planes": self.remove_planes,
         }
 
     def limits(self, num_threads: int | None) -> dict[str, Any]:
