@@ -37,6 +37,8 @@ def try_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path | None])
             continue
         if name == "--plot":
             ibi.plot._format(path)
+        if name == "--html":
+            ibi.plot._plotly()
         if name == "--rerun":
             ibi.viz._rerun()
         try_writing(path)

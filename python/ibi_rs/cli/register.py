@@ -92,6 +92,10 @@ def register(
     plot: Annotated[
         Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="A page (HTML) to turn and pick parts in with the mouse; needs no network."),
+    ] = None,
     rerun: Annotated[
         Path | None,
         typer.Option(help="A recording (RRD) of parts, matches and rounds; `rerun FILE` plays it."),
@@ -145,7 +149,7 @@ def register(
         remove_planes,
         unit,
     )
-    outputs = {"--output": output, "--bop": bop, "--plot": plot, "--rerun": rerun}
+    outputs = {"--output": output, "--bop": bop, "--plot": plot, "--html": html, "--rerun": rerun}
     inputs = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
     try_outputs(outputs, {**inputs, "SCENE": scene, "--corr": corr, "--params": params})
     options = search.limits(threads)
@@ -200,6 +204,10 @@ def register(
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes
         ibi.plot.instances(tgt if corr is not None else scan.points, src, found, plot, title=title)
+    if html is not None:
+        clouds = [src] if corr is not None else [one.points for one in parts]
+        seen = tgt if corr is not None else scan.points
+        ibi.plot.html(seen, clouds if len(clouds) > 1 else src, found, html, title=scene.name, unit=unit)
     if rerun is not None:
         if corr is None:  # once more, as `detect` keeps them to itself
             matches = part.correspond(tgt, **sight, num_threads=threads)
