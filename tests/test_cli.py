@@ -126,8 +126,8 @@ def test_poses_are_written_as_csv_in_a_unit(found, tmp_path):
     held = json.loads(poses.read_text())["poses"]
     options = ("-o", tmp_path / "p.csv", "--bop", tmp_path / "bop.csv", "--unit", "cm")
     assert run("register", MESH, SCAN, *options).exit_code == 0
-    rows = list(csv.DictReader((tmp_path / "p.csv").open()))
-    bop = list(csv.DictReader((tmp_path / "bop.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "p.csv").read_text().splitlines()))
+    bop = list(csv.DictReader((tmp_path / "bop.csv").read_text().splitlines()))
     for row, mm, pose in zip(rows, bop, held, strict=True):
         place = np.array(pose["target_from_source"])[:3, 3]
         np.testing.assert_allclose([float(row[axis]) for axis in "xyz"], place, rtol=1e-8)
@@ -742,7 +742,7 @@ def test_parameters_of_a_file_are_compared(done):
     line = "ibi: scan.json: made with other parameters (hv.t_score 0.5 for 0.9); done again\n"
     assert (result.exit_code, result.stderr) == (0, line)
     (folder / "p.toml").write_text("hv = 'none'")
-    result = skipping(folder, "--params", folder / "p.toml", **files)
+    result = skipping(folder, "--preset", "default", "--params", folder / "p.toml", **files)
     assert "(hv evidence for none)" in result.stderr
 
 
