@@ -19,7 +19,7 @@ from ibi_rs._numbers import lengths, significant
 from ibi_rs._written import checked_unit, quaternion
 
 if TYPE_CHECKING:
-    from ibi_rs.registration import Registration
+    from ibi_rs.registration import Pose, Registration, Rejected
 
 __all__ = ["MAX_POINTS", "html", "instances"]
 
@@ -161,6 +161,8 @@ def html(
     OSError
         The file cannot be written; then nothing of it is left.
     """
+    from ibi_rs.registration import Rejected
+
     go = _plotly()
     scene = _points("tgt", tgt)
     max_points = _count("max_points", max_points, 100)
@@ -177,24 +179,25 @@ def html(
     most = max(50, 4 * max_points // max(1, len(registration) + len(rejected)))
     parts = [_thinned(part, most) for part in parts]
 
-    def cloud(points: npt.NDArray[np.float64], **style: Any) -> Any:
+    def markers(points: npt.NDArray[np.float64], **style: Any) -> Any:
         columns = dict(zip("xyz", np.ascontiguousarray(points.T, np.float32), strict=True))
         return go.Scatter3d(**columns, **{"mode": "markers", **style})
 
     marker = {"size": 1.5, "color": "#9a9a9a"}
-    traces = [cloud(_thinned(scene, max_points), marker=marker, hoverinfo="skip", name="scene")]
+    traces = [markers(_thinned(scene, max_points), marker=marker, hoverinfo="skip", name="scene")]
     poses, centres = [], []
-    for k, one in enumerate([*registration, *rejected]):
+    every: list[Pose | Rejected] = [*registration, *rejected]
+    for k, one in enumerate(every):
         is_out = k >= len(registration)
         label = f"r{k - len(registration)}" if is_out else str(k)
-        objection = f", {one.objection}" if is_out else ""  # type: ignore[union-attr]
+        objection = f", {one.objection}" if isinstance(one, Rejected) else ""
         matrix = one.target_from_source
         moved = parts[one.model] @ matrix[:3, :3].T + matrix[:3, 3]
         centres.append((moved.min(axis=0) + moved.max(axis=0)) / 2)
         colour = "#d33" if is_out else _colour(k)
         hover = f"{label}: {one.score:.2f}{objection}<extra></extra>"
         style = {"marker": {"size": 2, "color": colour}, "hovertemplate": hover, "visible": not is_out}
-        traces.append(cloud(moved, name=label, **style))
+        traces.append(markers(moved, name=label, **style))
         poses.append(
             {
                 "trace": len(traces) - 1,
@@ -202,14 +205,14 @@ def html(
                 "name": " ".join([one.model_name or "", objection.removeprefix(", ")]).strip(),
                 "score": one.score,
                 "colour": colour,
-                "rejected": one.objection if is_out else None,  # type: ignore[union-attr]
+                "rejected": one.objection if isinstance(one, Rejected) else None,
                 "facts": _facts(one, registration.resolution, unit),
             }
         )
     if poses:
         texts = [pose["label"] for pose in poses]
         font = {"size": 13, "color": "#111"}
-        traces.append(cloud(np.array(centres), mode="text", text=texts, textfont=font, hoverinfo="skip"))
+        traces.append(markers(np.array(centres), mode="text", text=texts, textfont=font, hoverinfo="skip"))
     axes = {f"{axis}axis": {"title": {"text": f"{axis} [{unit}]" if unit else axis}} for axis in "xyz"}
     # As a camera at the origin sees it: x to the right, y down, z into the picture.
     camera = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.4, "y": -0.5, "z": -1.5}}

@@ -3,6 +3,16 @@
 from .terminal import FOUND_NOTHING, INTERRUPTED, TERMINATED, app
 
 # Each adds itself to `app`, and stands in the help, in this order.
-from . import register, batch, evaluate, bench  # isort: skip
+from . import register, batch, evaluate, bench, doctor  # isort: skip
 
-__all__ = ["FOUND_NOTHING", "INTERRUPTED", "TERMINATED", "app", "batch", "bench", "evaluate", "register"]
+__all__ = [
+    "FOUND_NOTHING",
+    "INTERRUPTED",
+    "TERMINATED",
+    "app",
+    "batch",
+    "bench",
+    "doctor",
+    "evaluate",
+    "register",
+]
