@@ -139,7 +139,9 @@ def beside_examples(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/stages.md", "docs/batch.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "docs/stages.md", "docs/batch.md", "docs/picking.md", "docs/own.md"]
+)
 def test_a_page_runs(name, beside_examples):
     text = (ROOT / name).read_text(encoding="utf-8")
     assert blocks(text), f"{name} shows no Python"
