@@ -88,6 +88,7 @@ def instances(
     middle = (scene.min(axis=0) + scene.max(axis=0)) / 2
     colours = colormaps["tab10" if len(poses) <= 10 else "tab20"]
 
+    size = 10 if len(poses) <= 20 else 7
     # No pyplot: it would keep the figure and may want a display.
     figure = Figure(figsize=(6.5 * len(turns_deg), 6.0), layout="constrained")
     FigureCanvasAgg(figure)
@@ -96,14 +97,27 @@ def instances(
         cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
         turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
         flat = (scene - middle) @ turn.T
+        centres = np.empty((len(poses), 2))
         axes.scatter(flat[:, 0], flat[:, 1], s=2, c="0.7", linewidths=0, zorder=0)
         for k, pose in enumerate(poses):
             moved = (model @ pose[:3, :3].T + pose[:3, 3] - middle) @ turn.T
             colour = colours(k % colours.N)
             axes.scatter(moved[:, 0], moved[:, 1], s=1.5, color=colour, alpha=0.5, linewidths=0, zorder=1)
-            centre = moved.mean(axis=0)
-            label = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": colour}
-            axes.annotate(str(k), centre[:2], ha="center", va="center", bbox=label, zorder=2)
+            centres[k] = moved[:, :2].mean(axis=0)
+        corners = np.concatenate([flat[:, :2], centres])
+        places = _apart(centres, 0.03 * np.ptp(corners, axis=0).max())
+        for k, (centre, place) in enumerate(zip(centres, places, strict=True)):
+            label = {"boxstyle": "circle,pad=0.15", "fc": "white", "ec": colours(k % colours.N)}
+            line = {"arrowstyle": "-", "color": "0.3", "lw": 0.6} if (place != centre).any() else None
+            style: dict[str, Any] = {
+                "ha": "center",
+                "va": "center",
+                "bbox": label,
+                "arrowprops": line,
+                "fontsize": size,
+            }
+            at, to = centre.tolist(), place.tolist()
+            axes.annotate(str(k), at, to, zorder=2, **style)
         axes.set_aspect("equal")
         axes.invert_yaxis()
         axes.set_axis_off()
@@ -114,6 +128,23 @@ def instances(
         with written(path) as part:
             figure.savefig(part, dpi=110, format=picture_format)
     return figure
+
+
+def _apart(centres: npt.NDArray[np.float64], distance: float) -> npt.NDArray[np.float64]:
+    """Move labels that would cover others to the nearest free place, on rings about their centres."""
+    places: list[npt.NDArray[np.float64]] = []
+    angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    for centre in centres:
+        held = np.array(places).reshape(-1, 2)
+        free = [centre]
+        for radius in range(1, len(places) + 2):
+            gaps = [np.linalg.norm(held - place, axis=1).min(initial=np.inf) for place in free]
+            if max(gaps) >= distance:
+                break
+            free = list(centre + radius * distance * ring)
+        places.append(free[int(np.argmax(np.array(gaps) >= distance))])
+    return np.array(places).reshape(-1, 2)
 
 
 def html(
