@@ -40,7 +40,7 @@ test: cargo $(STAMPS)/package $(STAMPS)/group-test ## run the tests of Rust and 
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4
 
 .PHONY: test-all
-test-all: cargo $(STAMPS)/package $(STAMPS)/open3d $(STAMPS)/group-all ## the same with all that is optional, none skipped (installs Open3D, Dask, Ray, Rerun)
+test-all: cargo $(STAMPS)/package $(STAMPS)/open3d $(STAMPS)/chromium $(STAMPS)/group-all ## the same with all that is optional, none skipped (installs Open3D, Dask, Ray, Rerun, Chromium)
 	$(RUST_TESTS)
 	$(BIN)/python -m pytest --none-skipped
 
@@ -180,6 +180,16 @@ $(STAMPS)/open3d: $(STAMPS)/group-bench
 			libusb-1.0-0 libgl1 libgomp1 >/dev/null || true; fi
 	@$(BIN)/python -c 'import open3d' || { \
 		echo "make: Open3D cannot be loaded; on Debian and Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1" >&2; exit 1; }
+	@touch $@
+
+# The browser that pages are tested in: the system's, as Playwright's own is no package.
+$(STAMPS)/chromium: $(STAMPS)/venv
+	@command -v chromium chromium-browser google-chrome >/dev/null || { \
+		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "make: installing Chromium with apt-get"; apt-get update -qq || true; \
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium >/dev/null || true; fi; }
+	@command -v chromium chromium-browser google-chrome >/dev/null || { \
+		echo "make: Chromium is missing; on Debian: apt-get install chromium" >&2; exit 1; }
 	@touch $@
 
 # A peer that cannot be had is a row of the comparison that says so, and not the end of it.

@@ -18,7 +18,18 @@ from scipy.optimize import minimize
 from verdict_metrics import HIDDEN, RIGHT, RIGHT_BELOW
 from verdict_searches import ROWS, Models, Search
 
-TERMS = ("1", "contradicted", "runs on", "beyond", "second loss", "third loss", "closeness", "supported", "ends", "evidence")
+TERMS = (
+    "1",
+    "contradicted",
+    "runs on",
+    "beyond",
+    "second loss",
+    "third loss",
+    "closeness",
+    "supported",
+    "ends",
+    "evidence",
+)
 SHARP = 0.1
 """As in odds.rs: the blur up to which a scan is sharp."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW

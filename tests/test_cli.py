@@ -58,7 +58,7 @@ def shifts(path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "unit"), [(1000, ()), (100, ("--unit", "cm")), (1 / 0.0254, ("--unit", "inch"))]
+    ("scale", "unit"), [(1000, ()), (100, ("--unit", "cm")), (1 / 0.0254, ("--unit", "in"))]
 )
 def test_the_csv_is_in_millimetres_whatever_the_unit(found, tmp_path, scale, unit):
     part, scan = trimesh.load(MESH), ibi.io.read_cloud(SCAN)[0]
@@ -81,7 +81,7 @@ def test_a_unit_that_cannot_be_told_is_asked_for(tmp_path):
     assert "may be in mm or m; say --unit" in result.stderr
     result = run("register", MESH, SCAN, "--bop", tmp_path / "a.csv", "--unit", "ell")
     assert result.exit_code == 2
-    assert "--unit ell: there are mm, cm, m, inch" in result.stderr
+    assert "--unit: unit is 'ell'; it must be one of m, cm, mm" in result.stderr
 
 
 def test_eval_scores_what_register_wrote(found, tmp_path):
@@ -114,6 +114,70 @@ def test_nothing_found_has_a_code_of_its_own(tmp_path):
     result = run("register", MESH, tmp_path / "waves.npy")
     assert result.exit_code == cli.FOUND_NOTHING
     assert "0 found" in result.stdout
+
+
+def test_one_value_is_changed_on_what_fits_the_scene(tmp_path):
+    """However it is said, the rest stays that of `single_view`, with which six are found."""
+    (tmp_path / "hv.toml").write_text("[hv]\nt_score = 0.9")
+    (tmp_path / "based.json").write_text('{"base": "single_view", "hv": {"t_score": 0.9}}')
+    wanted = ibi.Params.single_view().replace(hv={"t_score": 0.9})
+    for number, options in enumerate(
+        (
+            ("--set", "hv.t_score=0.9"),
+            ("--params", tmp_path / "hv.toml"),
+            ("--params", tmp_path / "hv.toml", "--preset", "single_view"),
+            ("--params", tmp_path / "based.json", "--preset", "default"),
+        )
+    ):
+        result = run("register", MESH, SCAN, "-o", tmp_path / f"{number}.json", *options)
+        assert result.exit_code == 0, result.output
+        held = json.loads((tmp_path / f"{number}.json").read_text())
+        assert held["params"] == wanted.to_dict()
+        assert 0 < len(held["poses"]) < 6
+
+
+def test_set_takes_words_numbers_and_none(tmp_path):
+    settings = (
+        "te=mac",
+        "te.t_cmp=.5",
+        "hv=none",
+        "max_rejections=none",
+        "max_rounds=3",
+        "joint_check=False",
+    )
+    options = [word for setting in settings for word in ("--set", setting)]
+    run("register", MESH, SCAN, "-o", tmp_path / "p.json", "--preset", "default", *options)
+    wanted = ibi.Params(
+        te=ibi.Mac(t_cmp=0.5), hv="none", max_rejections=None, max_rounds=3, joint_check=False
+    )
+    assert json.loads((tmp_path / "p.json").read_text())["params"] == wanted.to_dict()
+
+
+def test_poses_are_written_as_csv_in_a_unit(found, tmp_path):
+    _, (poses, *_) = found
+    held = json.loads(poses.read_text())["poses"]
+    options = ("-o", tmp_path / "p.csv", "--bop", tmp_path / "bop.csv", "--unit", "cm")
+    assert run("register", MESH, SCAN, *options).exit_code == 0
+    rows = list(csv.DictReader((tmp_path / "p.csv").read_text().splitlines()))
+    bop = list(csv.DictReader((tmp_path / "bop.csv").read_text().splitlines()))
+    for row, mm, pose in zip(rows, bop, held, strict=True):
+        place = np.array(pose["target_from_source"])[:3, 3]
+        np.testing.assert_allclose([float(row[axis]) for axis in "xyz"], place, rtol=1e-8)
+        np.testing.assert_allclose(np.fromstring(mm["t"], sep=" "), 10 * place, rtol=1e-7)
+        turn = Rotation.from_quat([float(row[f"q{axis}"]) for axis in "xyzw"]).as_matrix()
+        np.testing.assert_allclose(turn, np.array(pose["target_from_source"])[:3, :3], atol=1e-7)
+
+
+def test_poses_of_low_score_are_left_out(found, tmp_path):
+    _, (poses, *_) = found
+    scores = [pose["score"] for pose in json.loads(poses.read_text())["poses"]]
+    limit = sorted(scores)[2]
+    result = run("register", MESH, SCAN, "--min-score", limit, "-o", tmp_path / "some.json")
+    assert "4 found" in result.stdout
+    held = json.loads((tmp_path / "some.json").read_text())
+    assert [pose["score"] for pose in held["poses"]] == [score for score in scores if score >= limit]
+    assert held["search"]["min_score"] == limit
+    assert run("register", MESH, SCAN, "--min-score", 1).exit_code == cli.FOUND_NOTHING
 
 
 # What is refused ------------------------------------------------------------------------------------------
@@ -219,7 +283,7 @@ ONE_LINE = [
     (registering("--params", "garbage.json"), 1, "garbage.json: 'utf-8' codec can't decode"),
     (registering("--params", "typo.json"), 1, "typo.json: params: unknown field `t_z`"),
     (registering("--params", "range.toml"), 1, "range.toml: params.t_s is 1; it must be at least 3"),
-    (registering("--params", "word.toml"), 1, "word.toml: params: TOML parse error at line 1"),
+    (registering("--params", "word.toml"), 1, "word.toml: params.scs is 'gmt'; it must be one of 'gtm', "),
     (registering("--symmetries", "nowhere.json"), 1, "nowhere.json: cannot be read: No such file"),
     (registering("--symmetries", "folder.json"), 1, "folder.json: cannot be read: Is a directory"),
     (registering("--symmetries", "deep.json"), 1, "deep.json: cannot be read: it is nested too deeply"),
@@ -295,7 +359,14 @@ ONE_LINE = [
     (("bench", "-o", "no/where.json"), 1, "no/where.json: there is no folder no"),
     # The command line
     (registering("--preset", "best"), 2, "--preset best: there are default"),
-    (registering("--preset", "default", "--params", "good.json"), 2, "give --preset or --params, not both"),
+    (registering("--unit", "yd"), 2, "--unit: unit is 'yd'; it must be one of m, cm, mm, um, in, ft"),
+    (registering("--set", "hv.t_score"), 2, "--set hv.t_score: must be NAME=VALUE, as hv.t_score=0.97"),
+    (registering("--set", "=1"), 2, "--set =1: must be NAME=VALUE"),
+    (registering("--set", "hv.t_scor=1"), 2, "--set hv.t_scor=1: there is no parameter 'hv.t_scor'"),
+    (registering("--set", "hv.t_score=2"), 2, "--set: params.hv.t_score is 2; it must be between 0 and 1"),
+    (registering("--set", "te=mak"), 2, "--set: params.te is 'mak'; it must be one of 'gsac', "),
+    (registering("--set", "te.t_cmp=0.5"), 2, "--set: params: unknown field `t_cmp`"),
+    (registering("--preset", "best", "--params", "good.json"), 2, "--preset best: there are default"),
     (registering("--voxel", "0"), 2, "--voxel is 0; it must be above 0 and finite"),
     (registering("--voxel", "nan"), 2, "--voxel is nan; it must be above 0 and finite"),
     (registering("--timeout-s", "-1"), 2, "--timeout-s is -1; it must be from 0 to 1e9"),
@@ -699,11 +770,11 @@ def test_what_was_made_otherwise_is_done_again(done, options, why):
 def test_parameters_of_a_file_are_compared(done):
     folder, files = done
     skipping(folder, "--preset", "default", **files)
-    result = skipping(folder, "--params", folder / "p.toml", **files)
+    result = skipping(folder, "--preset", "default", "--params", folder / "p.toml", **files)
     line = "ibi: scan.json: made with other parameters (hv.t_score 0.5 for 0.9); done again\n"
     assert (result.exit_code, result.stderr) == (0, line)
     (folder / "p.toml").write_text("hv = 'none'")
-    result = skipping(folder, "--params", folder / "p.toml", **files)
+    result = skipping(folder, "--preset", "default", "--params", folder / "p.toml", **files)
     assert "(hv evidence for none)" in result.stderr
 
 

@@ -40,7 +40,7 @@ def test_examples_in_docstrings_print_what_they_say(name):
 
 def public():
     """What the seven namespaces export, each with its name."""
-    for module in (ibi, ibi.datasets, ibi.features, ibi.metrics, ibi.stages, ibi.synth, ibi.viz):
+    for module in (ibi, ibi.datasets, ibi.features, ibi.metrics, ibi.ros, ibi.stages, ibi.synth, ibi.viz):
         for name in module.__all__:
             thing = getattr(module, name)
             if inspect.isfunction(thing) or inspect.isclass(thing):
@@ -139,7 +139,10 @@ def beside_examples(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/stages.md", "docs/batch.md", "docs/datasets.md"])
+@pytest.mark.parametrize(
+    "name",
+    ["README.md", "docs/stages.md", "docs/batch.md", "docs/datasets.md", "docs/picking.md", "docs/own.md"],
+)
 def test_a_page_runs(name, beside_examples):
     text = (ROOT / name).read_text(encoding="utf-8")
     assert blocks(text), f"{name} shows no Python"

@@ -206,3 +206,15 @@ def test_far_from_the_origin_no_digit_is_lost():
     assert "e+" not in repr(found)
     assert repr(ibi.View(far, SCENE.tgt)).endswith("from [500123.267, 4600456.125, 0])")
     assert "e+" not in repr(ibi.Model(1e6 * SCENE.src))
+
+
+def test_numbers_of_many_parts_do_not_cover_each_other():
+    centres = np.random.default_rng(0).uniform(0, 100, (80, 2))
+    centres[40:50] = centres[0]  # one above the other
+    places = ibi.plot._apart(centres, 8.0)
+    gaps = np.linalg.norm(places[:, None] - places, axis=2) + np.diag(np.full(80, np.inf))
+    assert gaps.min() >= 8.0
+    # What is free stays where it is.
+    alone = np.array([[0.0, 0.0], [50.0, 0.0], [0.0, 50.0]])
+    np.testing.assert_array_equal(ibi.plot._apart(alone, 8.0), alone)
+    assert ibi.plot._apart(np.empty((0, 2)), 8.0).shape == (0, 2)

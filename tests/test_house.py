@@ -42,3 +42,43 @@ def test_no_python_module_imports_itself_by_way_of_others():
         for name, place in modules.items()
     }
     assert len(list(TopologicalSorter(graph).static_order())) == len(modules)
+
+
+# The house's address --------------------------------------------------------------------------------------
+
+
+def addresses():
+    """Each address of the repository that a published file has, and the path that it leads to."""
+    for name in ("README.md", "CITATION.cff", "pyproject.toml", "Cargo.toml"):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        for base, path in re.findall(
+            r"(https://github\.com/[\w-]+/[\w-]+)(?:/(?:blob|tree)/main/([^)\"#\s]+))?", text
+        ):
+            yield name, base, path
+        for owner, path in re.findall(
+            r"https://raw\.githubusercontent\.com/([\w-]+/[\w-]+)/main/([^)\s]+)", text
+        ):
+            yield name, f"https://github.com/{owner}", path
+
+
+def test_published_files_lead_to_one_repository():
+    """What a registry shows has no folder beside it: links are absolute, and what they lead to is here."""
+    found = list(addresses())
+    assert {name for name, _, _ in found} == {"README.md", "CITATION.cff", "pyproject.toml", "Cargo.toml"}
+    assert len({base for _, base, _ in found}) == 1
+    for name, _, path in found:
+        assert (ROOT / path).exists(), f"{name}: {path} is not there"
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert len(links) > 10
+    assert [link for link in links if not link.startswith(("https://", "#"))] == []
+
+
+def test_the_crate_has_the_licences():
+    for name in ("LICENSE-MIT", "LICENSE-APACHE"):
+        assert (ROOT / "crates/ibi-core" / name).read_bytes() == (ROOT / name).read_bytes()
+
+
+def test_the_citation_has_the_version():
+    (version,) = re.findall(r'(?m)^version = "(.+)"$', (ROOT / "Cargo.toml").read_text(encoding="utf-8"))
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")

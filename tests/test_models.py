@@ -404,7 +404,7 @@ def test_the_command_looks_into_a_box(files, scene):
     assert result.exit_code == 0, result.output
     held = json.loads(output.read_text())
     assert len(held["poses"]) == 1
-    assert "model" not in held["poses"][0]
+    assert held["poses"][0]["model_name"] is None
     assert len(held["search"]["crop"]) == 6
 
 

@@ -1,6 +1,8 @@
 """Parameters: the core's defaults, every way in and out, and what is refused."""
 
+import ast
 import copy
+import inspect
 import json
 import pickle
 import re
@@ -13,7 +15,7 @@ import ibi_rs as ibi
 import numpy as np
 import pytest
 from ibi_rs import _core
-from ibi_rs.params import Removal
+from ibi_rs.params import Preset, Removal
 from ibi_rs.variants import Ce, Hv, Scs, Te
 
 STAGES = ("scs", "ce", "te", "hv")
@@ -261,6 +263,90 @@ def test_replace_leaves_the_original():
         PLAIN.replace(t_z=6)
 
 
+SURE = {"hv": {"t_score": 0.97}}
+
+
+def test_one_value_is_changed_and_its_block_stays():
+    for before in (ibi.Params.single_view(), OTHER.replace(hv=ibi.Evidence(t_score=0.1, t_sure=0.3))):
+        after = before.replace(hv={"t_score": 0.97})
+        assert after == before.replace(**{"hv.t_score": 0.97})
+        wanted = before.to_dict()
+        wanted["hv"]["t_score"] = 0.97
+        assert after.to_dict() == wanted
+
+
+def test_several_values_of_several_blocks_are_changed():
+    after = PLAIN.replace(
+        t_s=5, te={"variant": "mac"}, **{"te.t_cmp": 0.5, "hv.t_sure": 0.7, "hv.t_score": 0.6}
+    )
+    assert after == ibi.Params(t_s=5, te=ibi.Mac(t_cmp=0.5), hv=ibi.Evidence(t_sure=0.7, t_score=0.6))
+    assert PLAIN.replace(te="mac", **{"te.t_cmp": 0.5}) == ibi.Params(te=ibi.Mac(t_cmp=0.5))
+    mac = ibi.Mac(t_sog=0.1)
+    assert PLAIN.replace(te=mac, **{"te.t_cmp": 0.5}).te == ibi.Mac(t_sog=0.1, t_cmp=0.5)
+    # Another variant has nothing of the one before.
+    assert PLAIN.replace(hv={"variant": "overlap"}).hv == ibi.Overlap()
+
+
+def test_a_value_of_another_variant_is_refused():
+    with pytest.raises(ibi.ParamsError, match="t_overlap"):
+        PLAIN.replace(hv={"t_overlap": 0.5})
+    with pytest.raises(TypeError, match="hw"):
+        PLAIN.replace(**{"hw.t_score": 0.5})
+    with pytest.raises(ibi.ParamsError, match=r"params\.te names no variant"):
+        ibi.Params(te=lambda context: None).replace(te={"n_gsac": 5})
+
+
+@pytest.mark.parametrize("name", get_args(Preset))
+def test_what_is_left_out_is_of_the_base(name):
+    preset = ibi.Params.preset(name)
+    assert preset == SETTINGS[name]
+    changes = {"base": name, "t_s": 7, "max_rejections": None, "hv": {"variant": "evidence", "t_score": 0.97}}
+    if preset.hv.variant == "evidence":
+        wanted = preset.replace(t_s=7, max_rejections=None, hv={"t_score": 0.97})
+    else:
+        wanted = preset.replace(t_s=7, max_rejections=None, hv=ibi.Evidence(t_score=0.97))
+    assert ibi.Params.from_dict(changes) == wanted
+    text = f'base = "{name}"\nt_s = 7\nmax_rejections = "none"\nhv = {{variant = "evidence", t_score = 0.97}}'
+    assert ibi.Params.from_toml(text) == wanted
+    without = {key: value for key, value in changes.items() if key != "base"}
+    assert ibi.Params.from_dict(without, base=preset) == wanted
+    assert ibi.Params.from_toml(text.partition("\n")[2], base=preset) == wanted
+    # What the data name comes before the argument.
+    assert ibi.Params.from_dict(changes, base=OTHER) == wanted
+
+
+def test_a_file_has_a_base(tmp_path):
+    for name, text in (
+        ("a.toml", 'base = "single_view"\n[hv]\nt_score = 0.97'),
+        ("a.json", json.dumps({"base": "single_view", **SURE})),
+    ):
+        (tmp_path / name).write_text(text)
+        assert ibi.Params.load(tmp_path / name) == ibi.Params.single_view().replace(**SURE)
+        (tmp_path / name).write_text(text.replace("single_view", "singel"))
+        with pytest.raises(ibi.ParamsError, match=f"{name}: params.base is 'singel'; it must be one of"):
+            ibi.Params.load(tmp_path / name)
+    # A base of one's own fits all that is complete, too.
+    OTHER.save(tmp_path / "whole.toml")
+    assert ibi.Params.load(tmp_path / "whole.toml", base=ibi.Params.single_view()) == OTHER
+
+
+def test_a_type_checker_is_told_of_the_same_arguments():
+    """Of `__init__` there are two: the dataclass's own, and the one that a type checker reads."""
+    tree = ast.parse(inspect.getsource(sys.modules[ibi.Params.__module__]))
+    (told,) = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
+    names = [argument.arg for argument in told.args.kwonlyargs]
+    assert names == [f.name for f in fields(ibi.Params)]
+    for f, default in zip(fields(ibi.Params), told.args.kw_defaults, strict=True):
+        assert eval(ast.unparse(default), vars(ibi)) == f.default, f.name
+    words = {
+        stage: get_args(getattr(sys.modules[ibi.Params.__module__], f"{stage.title()}Word"))
+        for stage in STAGES
+    }
+    assert words == {stage: tuple(v.variant for v in VARIANTS[stage]) for stage in STAGES} | {
+        "hv": ("evidence", "overlap", "inlier_count", "none")
+    }
+
+
 def test_numbers_become_plain_ones():
     params = ibi.Params(
         seed=np.int16(3), t_he_pr=np.float32(0.5), t_s=np.array(6), d_op_pr=2, scs=ibi.Gtm(n_gtm=np.uint8(9))
@@ -387,8 +473,9 @@ DATA = [
     ({"odd": {"x": NAN}}, "`odd`"),
     ({"scs": {"variant": "gtm", "n_gmt": 1}}, "`n_gmt`"),
     ({"te": {"variant": "gsac", "n_ransac": 1}}, "`n_ransac`"),
-    ({"te": {"n_gsac": 5}}, "params.te names no variant"),
-    ({"te": {}}, "params.te names no variant"),
+    ({"te": {"n_gsac": 5}}, "`n_gsac`"),
+    ({"base": "singel_view"}, "params.base is 'singel_view'; it must be one of 'default', 'paper_synthetic'"),
+    ({"base": ["default"]}, "params.base is ['default']; it must be one of 'default', "),
     ({"te": None}, "params.te is None; it must be one of 'gsac', "),
     ({"te": {"variant": "g"}}, "params.te is 'g'; it must be one of 'gsac', "),
     ({"te": {"variant": ["gsac"]}}, "params.te is ['gsac']; it must be one of 'gsac', "),

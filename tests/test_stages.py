@@ -570,6 +570,8 @@ def hv(context: StageContext, pose: np.ndarray) -> bool:
 
 ibi.Params(scs=scs, ce=lambda context, seeds: seeds, te=te, hv=hv)
 ibi.Params(te=ibi.Ransac())
+ibi.Params(scs="nnsr", ce="off", te="mac", hv="none")
+ibi.Params.preset("single_view").replace(hv={"t_score": 0.97})
 """
 
 
@@ -578,7 +580,7 @@ def test_types_help(tmp_path):
     lines = TYPED.replace("np.ndarray", "np.ndarray[tuple[int, int], np.dtype[np.float64]]")
     page, wrong = tmp_path / "page.py", tmp_path / "wrong.py"
     page.write_text(lines)
-    wrong.write_text(lines + "ibi.Params(te=hv)\nibi.Params(hv=scs)\n")
+    wrong.write_text(lines + "ibi.Params(te=hv)\nibi.Params(hv=scs)\nibi.Params(te='mak')\n")
     root = str(Path(ibi.__file__).parents[1])
     options = ["--strict", "--cache-dir", str(tmp_path / "cache"), "--config-file", os.devnull]
     before = os.environ.get("MYPYPATH")
@@ -588,4 +590,4 @@ def test_types_help(tmp_path):
     finally:
         os.environ.pop("MYPYPATH") if before is None else os.environ.update(MYPYPATH=before)
     assert fine[2] == 0, fine[0]
-    assert bad[0].count("[arg-type]") == 2, bad[0]
+    assert bad[0].count("[arg-type]") == 3, bad[0]

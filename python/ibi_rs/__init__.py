@@ -3,7 +3,7 @@
 Start with :func:`register`. Lengths in :class:`Params` are multiples of the resolution ``pr`` of the clouds.
 """
 
-from ibi_rs import datasets, features, io, metrics, plot, stages, synth, viz
+from ibi_rs import datasets, features, io, metrics, plot, ros, stages, synth, viz
 from ibi_rs._batch import register_batch
 from ibi_rs._box import Box
 from ibi_rs._core import InputError, ParamsError, __version__
@@ -96,6 +96,7 @@ __all__ = [
     "plot",
     "register",
     "register_batch",
+    "ros",
     "stages",
     "synth",
     "viz",

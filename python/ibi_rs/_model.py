@@ -50,8 +50,9 @@ class Model:
         Its local reference frames, as in :func:`register`.
     symmetries : Symmetries, optional
         What leaves it looking the same. Of two poses found that differ by nothing else (no point of the model
-        by more than 0.05 of its size) the better one is returned, whatever the parameters. By default none,
-        and then none is dropped.
+        by more than 0.05 of its size) the better one is returned, whatever the parameters; and of the poses
+        that look like it the one turned least: :meth:`Registration.canonical`. By default none, and then none
+        is dropped, nor turned.
 
     Raises
     ------
@@ -254,9 +255,9 @@ class Model:
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
 
-        The scene is thinned to :attr:`voxel`, or to what it can carry if it is coarser, its table and walls taken
-        away, its normals estimated; both clouds are described by FPFH over 6 voxels, and each scene point is joined
-        to the four model points most like it.
+        The scene is thinned to :attr:`voxel`, or to what it can carry if it is coarser, its table and walls
+        taken away, its normals estimated; both clouds are described by FPFH over 6 voxels, and each scene
+        point is joined to the four model points most like it.
 
         Parameters
         ----------
@@ -291,6 +292,7 @@ class Model:
         max_instances: int | None = None,
         timeout_s: float | None = None,
         callback: Callable[[Round], object] | None = None,
+        reference: Registration | npt.ArrayLike | None = None,
     ) -> Registration:
         """Find every instance of this model in a scan: :meth:`correspond`, then :meth:`register`.
 
@@ -326,6 +328,9 @@ class Model:
         timeout_s : float, optional
             Overrides that of ``params``; counted from this call. Where time runs out before the first round,
             the result is empty.
+        reference : Registration, (4, 4) or (K, 4, 4) array_like, optional
+            Of a model with symmetries, against what poses are turned least: as in
+            :meth:`Registration.canonical`.
 
         Returns
         -------
@@ -364,7 +369,7 @@ class Model:
         )
         if raw["resolution_set"] != params.resolution:
             params = params.replace(resolution=raw["resolution_set"])
-        return Registration._of(raw, params)
+        return self._turned(Registration._of(raw, params), reference)
 
     def register(
         self,
@@ -380,10 +385,11 @@ class Model:
         max_instances: int | None = None,
         timeout_s: float | None = None,
         callback: Callable[[Round], object] | None = None,
+        reference: Registration | npt.ArrayLike | None = None,
     ) -> Registration:
         """Find every instance of this model in a scene: :func:`register` without the model's arguments.
 
-        Parameters, returns, raises: those of :func:`register`.
+        Parameters, returns, raises: those of :func:`register`; ``reference``: as in :meth:`detect`.
         """
         params = _limited(params, max_instances, timeout_s)
         eye, measured = _cameras(viewpoint)
@@ -406,7 +412,11 @@ class Model:
             on_round=None if callback is None else on_round(callback),
             own=own_stages(params._own(), params.seed, self._points, target, pairs),
         )
-        return Registration._of(raw, params)
+        return self._turned(Registration._of(raw, params), reference)
+
+    def _turned(self, found: Registration, reference: Any) -> Registration:
+        """Of the poses that look the same give those turned least."""
+        return found if self._symmetries.is_none else found.canonical(self._symmetries, reference)
 
 
 def _symmetries(value: Symmetries | None) -> Symmetries:

@@ -112,6 +112,7 @@ class Models(Sequence[Model]):
         max_instances: int | None = None,
         timeout_s: float | None = None,
         callback: Callable[[Round], object] | None = None,
+        reference: Registration | npt.ArrayLike | None = None,
     ) -> Registration:
         """Find every instance of every model in a scan.
 
@@ -129,6 +130,8 @@ class Models(Sequence[Model]):
             share of what is left when its turn comes.
         callback : callable, optional
             As in :func:`register`; each model counts its rounds from 0. False ends all.
+        reference : optional
+            As in :meth:`Model.detect`.
 
         Returns
         -------
@@ -158,7 +161,9 @@ class Models(Sequence[Model]):
         )
         found = [Registration._of_part(raw, params, i, self._names[i]) for i, raw in enumerate(parts)]
         why = StopReason._of(reason, message)
-        return Registration._of_parts(self._names, found, ranking, params, why, total_s)
+        all_found = Registration._of_parts(self._names, found, ranking, params, why, total_s)
+        held = [part.symmetries for part in self._parts]
+        return all_found if all(one.is_none for one in held) else all_found.canonical(held, reference)
 
 
 def detect(
@@ -176,6 +181,7 @@ def detect(
     max_instances: int | None = None,
     timeout_s: float | None = None,
     callback: Callable[[Round], object] | None = None,
+    reference: Registration | npt.ArrayLike | None = None,
 ) -> Registration:
     """Find every instance of one part or of several in a scan: of models of which nothing is kept.
 
@@ -187,7 +193,7 @@ def detect(
         As in :class:`Models`.
     tgt, params, tgt_normals, viewpoint, remove_plane, check_units, roi
         As in :meth:`Models.detect`.
-    num_threads, max_instances, timeout_s, callback
+    num_threads, max_instances, timeout_s, callback, reference
         As in :meth:`Models.detect`. The time does not count for the models, which are made first.
 
     Returns
@@ -223,6 +229,7 @@ def detect(
         max_instances=max_instances,
         timeout_s=timeout_s,
         callback=callback,
+        reference=reference,
     )
 
 

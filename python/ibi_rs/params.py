@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -36,6 +36,11 @@ _P = TypeVar("_P", bound="Params")
 
 Refine = Literal["none", "icp", "icp_turns"]
 Removal = Literal["dense", "inliers"]
+Preset = Literal["default", "paper_synthetic", "paper_real", "single_view", "many_views"]
+ScsWord = Literal["gtm", "local_gtm", "nnsr", "hough3d"]
+CeWord = Literal["voting", "off"]
+TeWord = Literal["gsac", "irls", "ransac", "sac_cot", "mac"]
+HvWord = Literal["evidence", "overlap", "inlier_count", "none"]
 
 _STAGES: dict[str, tuple[type[Any], ...]] = {
     "scs": get_args(Scs),
@@ -142,6 +147,33 @@ class Params:
     max_instances: int | None = None
     timeout_s: float | None = None
 
+    if TYPE_CHECKING:  # a stage goes in as a word, too, and comes out as a variant: no field has two types
+
+        def __init__(
+            self,
+            *,
+            seed: int = 0,
+            resolution: float | None = None,
+            delta_r_pr: float = 1.0,
+            t_he_pr: float = 1.5,
+            d_op_pr: float = 1.5,
+            min_normal_cos: float | None = 0.3,
+            oriented_normals: bool = False,
+            t_s: int = 4,
+            scs: Scs | ScsWord | stages.SelectSeeds = LocalGtm(),
+            ce: Ce | CeWord | stages.Enhance = Voting(),
+            te: Te | TeWord | stages.EstimatePose = Irls(),
+            hv: Hv | HvWord | stages.Validate = Evidence(),
+            refine: Refine = "icp",
+            n_contest: int = 60,
+            joint_check: bool = True,
+            removal: Removal = "inliers",
+            max_rejections: int | None = 60,
+            max_rounds: int | None = None,
+            max_instances: int | None = None,
+            timeout_s: float | None = None,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         """Turn words into stages and let the core check everything."""
         for name, variants in _STAGES.items():
@@ -188,8 +220,41 @@ class Params:
         """
         return cls.from_dict(json.loads(_core.preset("many_views")))
 
+    @classmethod
+    def preset(cls: type[_P], name: Preset) -> _P:
+        """Return the preset of that name: ``default``, ``single_view`` and so on; ParamsError for others."""
+        return cls.from_dict(_preset(name))
+
     def replace(self: _P, **changes: Any) -> _P:
-        """Return a copy with ``changes``; unknown names raise TypeError."""
+        """Return a copy with ``changes``; unknown names raise TypeError.
+
+        Of a stage that is given as a dict, or by ``"stage.parameter"``, all else stays as it is; but another
+        ``variant`` brings its own defaults.
+
+        Examples
+        --------
+        >>> import ibi_rs as ibi
+        >>> params = ibi.Params.single_view()
+        >>> params.replace(hv={"t_score": 0.97}) == params.replace(**{"hv.t_score": 0.97})
+        True
+        >>> params.replace(hv={"t_score": 0.97}).hv.t_sure == params.hv.t_sure
+        True
+        """
+        blocks: dict[str, dict[str, Any]] = {}
+        for name in [name for name, value in changes.items() if "." in name or isinstance(value, Mapping)]:
+            stage, _, parameter = name.partition(".")
+            if stage not in _STAGES:
+                continue  # of which it is told as of other unknown names, or wrong values
+            value = changes.pop(name)
+            blocks.setdefault(stage, {}).update({parameter: value} if parameter else value)
+        for stage, block in blocks.items():
+            if stage in changes:  # te="mac" beside "te.t_cmp"
+                block = {"variant": getattr(changes[stage], "variant", changes[stage])} | block
+                if dataclasses.is_dataclass(changes[stage]):
+                    block = dataclasses.asdict(changes[stage]) | block
+            held = None if _is_own(getattr(self, stage)) else self._built_in()[stage]
+            data = {stage: _laid(stage, held, block)}
+            changes[stage] = _build(json.loads(_core.check_params(_dumps(data))))[stage]
         return dataclasses.replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -202,14 +267,16 @@ class Params:
         return self._built_in()
 
     @classmethod
-    def from_dict(cls: type[_P], data: Mapping[str, Any]) -> _P:
-        """Build from nested data; what is missing is defaulted, an unknown key raises ParamsError.
+    def from_dict(cls: type[_P], data: Mapping[str, Any], *, base: Params | None = None) -> _P:
+        """Build from nested data; an unknown key raises ParamsError.
 
-        A stage is a block that names its ``variant``, or the word alone.
+        What is missing is that of the preset that ``"base"`` names (``{"base": "single_view"}``), else that
+        of the argument ``base``, else the default. A stage is a block, or a word alone; a block that names
+        another ``variant`` than the base has brings its own defaults.
         """
         if not isinstance(data, Mapping):
             raise TypeError(f"params must be a mapping, not {type(data).__name__}")
-        blocks = {name: _block(name, value) if name in _STAGES else value for name, value in data.items()}
+        blocks = _on_base(data, base)
         return cls(**_build(json.loads(_core.check_params(_dumps(blocks)))))
 
     def to_toml(self) -> str:
@@ -217,9 +284,12 @@ class Params:
         return _core.params_to_toml(_dumps(self.to_dict()))
 
     @classmethod
-    def from_toml(cls: type[_P], text: str) -> _P:
-        """Build from the text of a parameter file; an unknown key raises ParamsError."""
-        return cls(**_build(json.loads(_core.params_from_toml(text))))
+    def from_toml(cls: type[_P], text: str, *, base: Params | None = None) -> _P:
+        """Build from the text of a parameter file, as :meth:`from_dict`."""
+        data = json.loads(_core.toml_to_json(text))
+        if base is None and "base" not in data and all(_is_whole(data.get(stage, "")) for stage in _STAGES):
+            return cls(**_build(json.loads(_core.params_from_toml(text))))  # errors of which name the line
+        return cls.from_dict(_with_nulls(data), base=base)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a parameter file; ``.toml`` or ``.json``."""
@@ -229,18 +299,21 @@ class Params:
             part.write_text(text, encoding="utf-8")
 
     @classmethod
-    def load(cls: type[_P], path: str | os.PathLike[str]) -> _P:
-        """Read a parameter file; ``.toml`` or ``.json``. ParamsError names it and what is wrong in it."""
+    def load(cls: type[_P], path: str | os.PathLike[str], *, base: Params | None = None) -> _P:
+        """Read a parameter file; ``.toml`` or ``.json``. ParamsError names it and what is wrong in it.
+
+        What it leaves out is taken as by :meth:`from_dict`.
+        """
         path = Path(path)
         is_toml = _is_toml(path)
         try:
             text = path.read_text(encoding="utf-8-sig")
             if is_toml:
-                return cls.from_toml(text)
+                return cls.from_toml(text, base=base)
             data = json.loads(text)
             if not isinstance(data, dict):
                 raise _core.ParamsError(f"must be a JSON object, not {_shown(data)}")
-            return cls.from_dict(data)
+            return cls.from_dict(data, base=base)
         except RecursionError:
             raise _core.ParamsError(f"{path}: it is nested too deeply") from None
         except ValueError as error:  # of the text, its encoding or the parameters
@@ -289,13 +362,57 @@ def _is_own(stage: Any) -> bool:
     return callable(stage) and not isinstance(stage, type)
 
 
-def _block(stage: str, value: Any) -> Mapping[str, Any]:
-    """Complete a stage that was given by its word, and see that it names a variant."""
-    block = value if isinstance(value, Mapping) else {"variant": value}
-    if "variant" not in block:
+def _preset(name: Any) -> dict[str, Any]:
+    allowed = get_args(Preset)
+    if not isinstance(name, str) or name not in allowed:
+        raise _core.ParamsError(
+            f"params.base is {_shown(name)}; it must be one of {', '.join(map(repr, allowed))}"
+        )
+    preset: dict[str, Any] = json.loads(_core.preset(name))
+    return preset
+
+
+def _on_base(data: Mapping[str, Any], base: Params | None) -> dict[str, Any]:
+    """Lay data over the preset that they name, or over the base; their stages over its stages."""
+    own = dict(data)
+    held = {} if base is None else base.to_dict()
+    if "base" in own:
+        held = _preset(own.pop("base"))
+    stages_of_default = json.loads(_core.preset("default"))
+    for stage in _STAGES.keys() & own.keys():
+        own[stage] = _laid(stage, held.get(stage, stages_of_default[stage]), own[stage])
+    return {**held, **own}
+
+
+def _laid(stage: str, held: Mapping[str, Any] | None, value: Any) -> dict[str, Any]:
+    """Lay a stage, a block or a word, over the one that is held; None: a callable."""
+    block = dict(value) if isinstance(value, Mapping) else {"variant": value}
+    if held is None and "variant" not in block:
         raise _core.ParamsError(f"params.{stage} names no variant; add 'variant' to its block")
-    _variant(stage, block["variant"])
+    if held is not None:
+        block.setdefault("variant", held["variant"])
+    variant = _variant(stage, block["variant"]).variant
+    if held is not None and variant == held["variant"] and isinstance(value, Mapping):
+        return {**held, **block}
     return block
+
+
+def _is_whole(block: Any) -> bool:
+    """Whether a stage names its variant, or is a word."""
+    return not isinstance(block, Mapping) or "variant" in block
+
+
+def _with_nulls(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Copy what TOML holds, which says "none" for None."""
+    out = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            value = _with_nulls(value, f"{name}.")
+        elif value == "none" and type(None) in get_args(_HINTS.get(name)):
+            value = None
+        out[key] = value
+    return out
 
 
 def _variant(stage: str, word: Any) -> type[Any]:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
 
+from ibi_rs import _written
 from ibi_rs._core import InputError
+from ibi_rs._files import read_json, written
 from ibi_rs._numbers import lengths, significant
 from ibi_rs.params import Params
 from ibi_rs.symmetries import Symmetries
@@ -425,7 +429,11 @@ class Registration(Sequence[Pose]):
         What is doubtful about the input, one line each: :meth:`Model.detect` looks for it. Mostly empty.
     models : tuple of str
         Names of the models, if they are of :class:`Models`; else empty.
+    symmetries : tuple of Symmetries
+        Those of each model by which the poses were turned least; empty where none were.
     """
+
+    symmetries: tuple[Symmetries, ...] = ()
 
     def __init__(
         self,
@@ -566,24 +574,148 @@ class Registration(Sequence[Pose]):
         """One entry per round that was played to its end."""
         return tuple(Round._from_dict(data) for data in json.loads(self._rounds))
 
+    def at_least(self, score: float) -> Registration:
+        """Return the same without the poses of a lower score.
+
+        To get more poses than there are, lower ``hv.t_score`` before the run.
+
+        Parameters
+        ----------
+        score : float
+            0 to 1.
+
+        Returns
+        -------
+        Registration
+            Its ``labels`` of the poses that are left out are -1.
+
+        Raises
+        ------
+        InputError
+            The score is not from 0 to 1.
+        """
+        if not 0 <= score <= 1:
+            raise InputError(f"score is {score}; it must be from 0 to 1")
+        kept = copy(self)
+        rows = [row for row, pose in enumerate(self) if pose.score >= score]
+        new = np.full(len(self) + 1, -1, np.int32)  # the last is of -1, of none
+        new[rows] = np.arange(len(rows))
+        kept.poses, kept.labels = tuple(self.poses[row] for row in rows), new[self.labels]
+        kept._parts = {name: part.at_least(score) for name, part in self._parts.items()}
+        return kept
+
     def canonical(
-        self, symmetries: Symmetries | Sequence[Symmetries], reference: npt.ArrayLike | None = None
+        self,
+        symmetries: Symmetries | Sequence[Symmetries],
+        reference: Registration | npt.ArrayLike | None = None,
     ) -> Registration:
         """Return the same with each pose as :meth:`Pose.canonical` gives it.
 
-        Of :class:`Models` the symmetries of each.
+        Parameters
+        ----------
+        symmetries : Symmetries or sequence of Symmetries
+            Of the model; of :class:`Models` those of each.
+        reference : Registration, (4, 4) or (K, 4, 4) array_like, optional
+            Against what poses are turned least: by default the identity. Of several poses it is the one whose
+            centre is nearest, and of a registration only those of the same model count: with that of the
+            last frame a part that has not moved stays as it was.
+
+        Returns
+        -------
+        Registration
         """
         of = [symmetries] if isinstance(symmetries, Symmetries) else list(symmetries)
         num = max(1, len(self._parts))
         if len(of) != num:
             raise InputError(f"symmetries: there are {len(of)} of {num} models")
         turned = copy(self)
-        turned.poses = tuple(pose.canonical(of[pose.model], reference) for pose in self)
+        turned.poses = tuple(
+            pose.canonical(of[pose.model], _reference(reference, pose)) for pose in self.poses
+        )
+        turned.symmetries = tuple(of)
         turned._parts = {}
         for one, (name, part) in zip(of, self._parts.items(), strict=False):
             turned._parts[name] = copy(part)
-            turned._parts[name].poses = tuple(pose.canonical(one, reference) for pose in part)
+            turned._parts[name].symmetries = (one,)
+            turned._parts[name].poses = tuple(
+                pose.canonical(one, _reference(reference, pose)) for pose in part.poses
+            )
         return turned
+
+    def to_dict(self, *, unit: str | None = None, frame: str = "scene", run: bool = True) -> dict[str, Any]:
+        """Return all of it as plain data, for JSON; the form is that of the page *Poses out*.
+
+        Parameters
+        ----------
+        unit : str, optional
+            What the data are in, which is noted: ``"m"``, ``"cm"``, ``"mm"``, ``"um"``, ``"in"`` or ``"ft"``.
+        frame : str
+            The name of the frame that the poses lead to, which is noted.
+        run : bool
+            Whether labels, rounds, measures, timings and what was rejected are in it.
+
+        Returns
+        -------
+        dict
+
+        Raises
+        ------
+        InputError
+            The unit has no name here.
+        """
+        return _written.registration_dict(self, unit, frame, run)
+
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> Registration:
+        """Build from what :meth:`to_dict` has returned; InputError says what is wrong with it.
+
+        Where it was written without the run there are no labels and rounds, and timings are 0. Of
+        stages that were callables the parameters have the defaults.
+        """
+        return _written.registration_of(data)
+
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        unit: str | None = None,
+        frame: str = "scene",
+        run: bool = True,
+    ) -> None:
+        """Write it to a file: ``.json`` of :meth:`to_dict`, or ``.csv``, a line for each pose.
+
+        Parameters
+        ----------
+        path : path
+            The columns of a CSV file are model, score, x, y, z, qx, qy, qz, qw and how well the pose fits.
+        unit, frame, run
+            As in :meth:`to_dict`; a CSV file has no place for them.
+
+        Raises
+        ------
+        InputError
+            The name has another suffix, or the unit has no name here.
+        OSError
+            The file cannot be written; then nothing of it is left.
+        """
+        path = Path(path)
+        if path.suffix.lower() == ".csv":
+            text = _written.poses_csv(self)
+        elif path.suffix.lower() == ".json":
+            text = json.dumps(self.to_dict(unit=unit, frame=frame, run=run)) + "\n"
+        else:
+            raise InputError(f"{path}: registrations are written as .json or .csv")
+        with written(path) as part:
+            part.write_text(text, encoding="utf-8")
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Registration:
+        """Read a JSON file that :meth:`save` or ``ibi register -o`` has written; InputError names it."""
+        try:
+            return _written.registration_of(read_json(path))
+        except InputError as error:
+            text = str(error)
+            raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -613,3 +745,24 @@ class Registration(Sequence[Pose]):
         warnings = (f"  warning: {warning}" for warning in self.warnings)
         poses = (f"  {pose._shown(self.resolution)}" for pose in self.poses)
         return "\n".join([head, *warnings, *poses])
+
+
+def _reference(given: Any, pose: Pose) -> npt.NDArray[np.float64] | None:
+    """Return the one of several poses that is nearest to a pose; None: there is none."""
+    if given is None:
+        return None
+    if isinstance(given, Registration):
+        matrices = np.array([one.target_from_source for one in given if one.model == pose.model])
+    else:
+        matrices = np.asarray(getattr(given, "target_from_source", given), np.float64)
+    if matrices.size == 0:
+        return None
+    if matrices.shape[-2:] != (4, 4) or matrices.ndim not in (2, 3):
+        raise InputError(f"reference has shape {matrices.shape}; it must be (4, 4) or (K, 4, 4)")
+    if matrices.ndim == 2:
+        return matrices
+    turn, shift = pose.target_from_source[:3, :3], pose.target_from_source[:3, 3]
+    centre = turn.T @ (pose.centre - shift)  # in the model's frame
+    places = matrices[:, :3, :3] @ centre + matrices[:, :3, 3]
+    nearest: npt.NDArray[np.float64] = matrices[np.argmin(np.linalg.norm(places - pose.centre, axis=1))]
+    return nearest

@@ -9,7 +9,8 @@ pub(crate) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(preset, m)?)?;
     m.add_function(wrap_pyfunction!(check_params, m)?)?;
     m.add_function(wrap_pyfunction!(params_to_toml, m)?)?;
-    m.add_function(wrap_pyfunction!(params_from_toml, m)?)
+    m.add_function(wrap_pyfunction!(params_from_toml, m)?)?;
+    m.add_function(wrap_pyfunction!(toml_to_json, m)?)
 }
 
 /// Params from JSON, checked.
@@ -71,6 +72,13 @@ fn params_from_toml(text: &str) -> PyResult<String> {
     let params: Params = toml::from_str(&with_blocks(text)).map_err(invalid)?;
     params.validate().or_py_err()?;
     to_json(&params)
+}
+
+/// Rewrites the text of a parameter file, of which nothing is checked and to which nothing is added.
+#[pyfunction]
+fn toml_to_json(text: &str) -> PyResult<String> {
+    let plain: serde_json::Value = toml::from_str(text).map_err(invalid)?;
+    serde_json::to_string(&plain).map_err(invalid)
 }
 
 /// Makes `scs = "gtm"` a block, as `Params(scs="gtm")` does. In the text, so that errors keep their lines.

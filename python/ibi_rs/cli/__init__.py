@@ -3,7 +3,7 @@
 from .terminal import FOUND_NOTHING, INTERRUPTED, TERMINATED, app
 
 # Each adds itself to `app`, and stands in the help, in this order.
-from . import register, batch, bop, evaluate, bench  # isort: skip
+from . import register, batch, bop, evaluate, bench, doctor  # isort: skip
 
 __all__ = [
     "FOUND_NOTHING",
@@ -13,6 +13,7 @@ __all__ = [
     "batch",
     "bench",
     "bop",
+    "doctor",
     "evaluate",
     "register",
 ]

@@ -30,20 +30,26 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    CameraOf,
     Crop,
+    DepthScale,
     FromAllSides,
     MaxInstances,
+    MinScore,
     ModelFile,
     ParamsFile,
     Preset,
     RemovePlane,
+    RemovePlanes,
     Search,
+    Set,
     SymmetriesOf,
     TimeoutS,
     Unit,
     Viewpoint,
     Voxel,
-    chosen_params,
+    changes_of,
+    unit_of,
 )
 from .terminal import (
     MAX_THREADS,
@@ -63,14 +69,20 @@ def batch(
         list[Path],
         typer.Argument(help="Scans, of any kind that `register` reads.", metavar="SCENES"),
     ],
+    camera: CameraOf = None,
+    depth_scale: DepthScale = None,
     viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    remove_planes: RemovePlanes = None,
     crop: Crop = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
+    settings: Set = None,
+    min_score: MinScore = None,
+    unit: Unit = None,
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
     jobs: Annotated[
@@ -84,7 +96,6 @@ def batch(
         Path | None, typer.Option("-o", "--output", help="Folder for the poses: a JSON for each scan.")
     ] = None,
     bop: Annotated[Path | None, typer.Option(help="All poses as BOP's CSV: t in mm.")] = None,
-    unit: Unit = None,
     obj_id: Annotated[int, typer.Option(min=0, help="obj_id in the CSV.")] = 1,
     skip_existing: Annotated[
         bool,
@@ -117,9 +128,23 @@ def batch(
     """
     if skip_existing and output is None:
         misused("--skip-existing looks into the folder of -o; give it")
-    chosen = chosen_params(preset, params)
+    unit = unit_of(unit)
+    changes = changes_of(preset, params, settings)
     search = Search(
-        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries, crop
+        viewpoint,
+        from_all_sides,
+        voxel,
+        remove_plane,
+        changes,
+        max_instances,
+        timeout_s,
+        symmetries,
+        crop,
+        min_score,
+        camera,
+        depth_scale,
+        remove_planes,
+        unit,
     )
     start = time.perf_counter()
     targets = _targets(scenes, output)
@@ -138,19 +163,26 @@ def batch(
     new = [i for i in range(len(scenes)) if i not in outcomes]
     # Without a viewpoint a job takes the normals of its file.
     options = [search.sight(None, _place(scenes[i])) | search.limits(None) for i in new]
-    todo = [_TimedJob(part, scenes[i], params=chosen, **own) for i, own in zip(new, options, strict=True)]
+    # Of an image, or without planes, all is made where the job runs.
+    by = search if camera is not None or remove_planes is not None else None
+    todo = [
+        _TimedJob(part, scenes[i], params=search.params, search=by, **own)
+        for i, own in zip(new, options, strict=True)
+    ]
 
     def keep(number: int, found: ibi.Registration | ibi.JobError) -> None:
         i, job = new[number], todo[number]
         if not isinstance(found, ibi.JobError):
-            found = found if part.symmetries.is_none else found.canonical(part.symmetries)
+            found = search.kept(found)
             for warning in found.warnings:
                 warn(f"{scenes[i]}: {warning}")
         outcome = _outcome(job, found)
         target = targets[i]
         if target is not None and not isinstance(found, ibi.JobError):
             of_scene: dict[str, Any] = {"scene": scenes[i], "scene_sha256": job.sha256[-1]}
-            write_json(target, as_dict(found, outcome.seconds, **of_model, **of_scene, search=recorded))
+            write_json(
+                target, as_dict(found, outcome.seconds, **of_model, **of_scene, search=recorded, unit=unit)
+            )
         outcomes[i] = outcome
 
     try:
@@ -185,12 +217,18 @@ class _TimedJob(ibi.Job):
 
     seconds: list[float] = field(default_factory=list, kw_only=True)
     sha256: list[str] = field(default_factory=list, kw_only=True)
+    search: Search | None = field(default=None, kw_only=True)
 
     def run(self, **options: Any) -> ibi.Registration:
         start = time.perf_counter()
-        found = super().run(**options)
-        self.seconds.append(time.perf_counter() - start)
         assert self.path is not None
+        if self.search is None:
+            found = super().run(**options)
+        else:
+            tgt, sight = self.search.look(self.search.read(self.path), self.model.voxel)
+            num_threads = options.pop("num_threads", None)
+            found = self.model.detect(tgt, self.params, **sight, **self.search.limits(num_threads), **options)
+        self.seconds.append(time.perf_counter() - start)
         self.sha256.append(sha256(self.path))
         return found
 

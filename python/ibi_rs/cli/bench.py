@@ -25,10 +25,11 @@ from .search import (
     Preset,
     RemovePlane,
     Search,
+    Set,
     TimeoutS,
     Viewpoint,
     Voxel,
-    chosen_params,
+    changes_of,
 )
 from .terminal import command, err, misused, out
 
@@ -46,6 +47,7 @@ def bench(
     remove_plane: RemovePlane = None,
     preset: Preset = None,
     params: ParamsFile = None,
+    settings: Set = None,
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
     repeats: Annotated[int, typer.Option(min=1, help="Runs, after one that does not count.")] = 10,
@@ -65,8 +67,8 @@ def bench(
     """
     if (model is None) != (scene is None):
         misused("give MODEL and SCENE, or neither")
-    chosen = chosen_params(preset, params)
-    search = Search(viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s)
+    changes = changes_of(preset, params, settings)
+    search = Search(viewpoint, from_all_sides, voxel, remove_plane, changes, max_instances, timeout_s)
     try_outputs({"--output": output}, {"MODEL": model, "SCENE": scene, "--params": params})
     cores = _batch._cores()
     runs: dict[int, list[dict[str, float]]] = {}
@@ -128,11 +130,10 @@ def _time_files(
     sight = search.sight(scan.normals, scan.viewpoint)
     matches = part.correspond(scan.points, **sight, num_threads=threads)
     watch.lap("match")
-    default = ibi.Params.many_views() if search.from_all_sides else ibi.Params.single_view()
     found = part.register(
         matches.tgt,
         matches.corr,
-        search.params or default,
+        search.params_for(),
         tgt_normals=matches.tgt_normals,
         similarity=matches.similarity,
         viewpoint=sight["viewpoint"],
@@ -152,7 +153,7 @@ def _time_synthetic(search: Search, threads: int) -> tuple[dict[str, float], ibi
     watch = _Watch()
     part = ibi.Model(scene.src)
     watch.lap("model")
-    found = part.register(scene.tgt, scene.corr, search.params, **search.limits(threads))
+    found = part.register(scene.tgt, scene.corr, search.changes.on(ibi.Params()), **search.limits(threads))
     watch.lap("register")
     return watch.end(found), found
 

@@ -26,7 +26,7 @@ from ibi_rs._files import try_writing
 from ibi_rs.datasets import BopImage
 
 from .outputs import sha256
-from .search import MaxInstances, ParamsFile, Preset, TimeoutS, Voxel, chosen_params
+from .search import MaxInstances, ParamsFile, Preset, TimeoutS, Voxel, changes_of
 from .terminal import MAX_THREADS, command, err, misused, out, say
 
 _WINDOW = 4
@@ -95,7 +95,8 @@ def bop(
     """
     if (output is None) == (score is None):
         misused("give -o to make a CSV, or --score to score one")
-    chosen = chosen_params(preset, params)
+    changes = changes_of(preset, params, None)
+    chosen = changes.on(ibi.Params.single_view()) if changes.is_any else None
     cameras: Any = camera[0] if camera and len(camera) == 1 else camera or None
     scenes = datasets.Bop(dataset, split=split, camera=cameras, targets=targets, objects=_numbers(objects))
     if score is not None:

@@ -18,6 +18,7 @@ from rich.table import Table
 import ibi_rs as ibi
 from ibi_rs._files import try_writing, written
 from ibi_rs._numbers import lengths
+from ibi_rs._written import METRES, quaternion
 
 from .terminal import Printer, misused, out
 
@@ -36,6 +37,8 @@ def try_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path | None])
             continue
         if name == "--plot":
             ibi.plot._format(path)
+        if name == "--html":
+            ibi.plot._plotly()
         if name == "--rerun":
             ibi.viz._rerun()
         try_writing(path)
@@ -80,15 +83,9 @@ def print_table(table: Table) -> None:
 
 def _rotation_vector(rotation: Any) -> Any:
     """Axis times angle, by the quaternion: exact for half turns, too."""
-    four = np.empty((4, 4))  # 4 q qT, whose rows are all the quaternion q, (w, x, y, z), times something
-    four[0, 0] = 1 + np.trace(rotation)
-    off = rotation - rotation.T
-    four[0, 1:] = four[1:, 0] = off[2, 1], off[0, 2], off[1, 0]
-    four[1:, 1:] = rotation + rotation.T + (1 - np.trace(rotation)) * np.eye(3)
-    quaternion = four[np.argmax(np.diag(four))]
-    quaternion = quaternion / np.linalg.norm(quaternion) * np.copysign(1, quaternion[0])
-    sine = float(np.linalg.norm(quaternion[1:]))
-    return quaternion[1:] * (2 * np.arctan2(sine, quaternion[0]) / max(sine, 1e-300))
+    *axis, cosine = quaternion(rotation)
+    sine = float(np.linalg.norm(axis))
+    return np.array(axis) * (2 * np.arctan2(sine, cosine) / max(sine, 1e-300))
 
 
 def sha256(path: Path) -> str:
@@ -109,39 +106,18 @@ def as_dict(
     scene: Path,
     scene_sha256: str,
     search: dict[str, Any],
+    unit: str | None = None,
 ) -> dict[str, Any]:
     """Bring the poses into the form of the JSON files, with all that they depend on."""
     return {
-        "ibi_rs": ibi.__version__,
+        **found.to_dict(unit=unit, run=False),
         "model": str(model) if isinstance(model, Path) else list(map(str, model)),
         "model_sha256": model_sha256,
         "scene": str(scene),
         "scene_sha256": scene_sha256,
         "search": search,
-        "poses": [
-            {
-                **(_part(pose) if len(found.models) > 1 else {}),
-                "target_from_source": pose.target_from_source.tolist(),
-                "score": pose.score,
-                "overlap": pose.overlap,
-                "num_inliers": pose.num_inliers,
-                "inlier_rmse": pose.inlier_rmse,
-                "centre": pose.centre.tolist(),
-                "covariance": None if pose.covariance is None else pose.covariance.tolist(),
-                "free_motions": [free.to_dict() for free in pose.free_motions],
-            }
-            for pose in found
-        ],
-        "warnings": list(found.warnings),
-        "stop_reason": str(found.stop_reason),
         "seconds": round(seconds, 4),
-        "resolution": found.resolution,
-        "params": found.params.to_dict(),
     }
-
-
-def _part(pose: ibi.Pose) -> dict[str, Any]:
-    return {"model": pose.model, "model_name": pose.model_name}
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:
@@ -150,19 +126,14 @@ def write_json(path: Path, data: dict[str, Any]) -> None:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
-
-
 def millimetres(unit: str | None, *diameters: float) -> float:
     """Return how many millimetres the unit of the data has: as it is said, or by the size of the parts."""
     if unit is not None:
-        if unit not in MM:
-            misused(f"--unit {unit}: there are {', '.join(MM)}")
-        return MM[unit]
+        return 1000 * METRES[unit]
     if max(diameters) < 1:  # one of a millimetre would be a grain
-        return MM["m"]
+        return 1000.0
     if min(diameters) > 10:  # one of ten metres is no part
-        return MM["mm"]
+        return 1.0
     sizes = ", ".join(f"{one:.4g}" for one in diameters)
     misused(f"--bop writes millimetres, and a part {sizes} across may be in mm or m; say --unit")
 

@@ -23,22 +23,28 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    CameraOf,
     Crop,
+    DepthScale,
     FromAllSides,
     MaxInstances,
+    MinScore,
     ModelFiles,
     ParamsFile,
     Preset,
     RemovePlane,
+    RemovePlanes,
     SceneFile,
     Search,
+    Set,
     SymmetriesOf,
     TimeoutS,
     Unit,
     Viewpoint,
     Voxel,
-    chosen_params,
+    changes_of,
     symmetries_of,
+    unit_of,
 )
 from .terminal import (
     FOUND_NOTHING,
@@ -61,24 +67,33 @@ def register(
             help="Your own correspondences (NPY or text): pairs of rows, or of points; MODEL is a cloud then."
         ),
     ] = None,
+    camera: CameraOf = None,
+    depth_scale: DepthScale = None,
     viewpoint: Viewpoint = None,
     from_all_sides: FromAllSides = False,
     voxel: Voxel = None,
     remove_plane: RemovePlane = None,
+    remove_planes: RemovePlanes = None,
     crop: Crop = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
+    settings: Set = None,
+    min_score: MinScore = None,
+    unit: Unit = None,
     max_instances: MaxInstances = None,
     timeout_s: TimeoutS = None,
     threads: Annotated[
         int | None, typer.Option(min=1, max=MAX_THREADS, help="Default: all that the process may use.")
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON, or as .csv.")] = None,
     bop: Annotated[Path | None, typer.Option(help="Poses as BOP's CSV: t in mm.")] = None,
-    unit: Unit = None,
     plot: Annotated[
         Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="A page (HTML) to turn and pick parts in with the mouse; needs no network."),
     ] = None,
     rerun: Annotated[
         Path | None,
@@ -92,6 +107,8 @@ def register(
     With your own matches:         ibi register part.npy scan.npy --corr m.npy
 
     Several parts in one scan:     ibi register bolt.stl nut.stl scan.ply
+
+    A depth image:                 ibi register part.stl d.png --camera cam.json
 
     Of several parts each MODEL is looked for, and then all poses compete for
     what was measured. --bop numbers them from 1 in the order of the command.
@@ -107,15 +124,31 @@ def register(
     model = models[0]
     if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
         misused("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
-    if corr is not None and crop is not None:
-        misused("--corr brings the matches: --crop has no say then")
+    idle = {"--crop": crop, "--camera": camera, "--remove-planes": remove_planes}
+    if corr is not None and any(value is not None for value in idle.values()):
+        names = [name for name, value in idle.items() if value is not None]
+        misused(f"--corr brings the matches: {', '.join(names)} has no say then")
     if len(models) > 1:
         _try_several(corr, plot, rerun, symmetries)
-    chosen = chosen_params(preset, params)
+    unit = unit_of(unit)
+    changes = changes_of(preset, params, settings)
     search = Search(
-        viewpoint, from_all_sides, voxel, remove_plane, chosen, max_instances, timeout_s, symmetries, crop
+        viewpoint,
+        from_all_sides,
+        voxel,
+        remove_plane,
+        changes,
+        max_instances,
+        timeout_s,
+        symmetries,
+        crop,
+        min_score,
+        camera,
+        depth_scale,
+        remove_planes,
+        unit,
     )
-    outputs = {"--output": output, "--bop": bop, "--plot": plot, "--rerun": rerun}
+    outputs = {"--output": output, "--bop": bop, "--plot": plot, "--html": html, "--rerun": rerun}
     inputs = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
     try_outputs(outputs, {**inputs, "SCENE": scene, "--corr": corr, "--params": params})
     options = search.limits(threads)
@@ -127,25 +160,24 @@ def register(
             mm = 0.0 if bop is None else millimetres(unit, metrics.diameter(io.read_cloud(model)[0]))
             src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
         else:
-            scan = io.read_scan(scene)
-            tgt, sight = scan.points, search.sight(scan.normals, scan.viewpoint)
+            scan = search.read(scene)
             parts = [search.model(one, threads) for one in models]
             part = parts[0]
             mm = 0.0 if bop is None else millimetres(unit, *(one.diameter for one in parts))
+            tgt, sight = search.look(scan, min(one.voxel for one in parts))
             src, held = part.points, part.symmetries
             status.update("detecting")
             kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
             found = kinds.detect(
                 tgt,
-                chosen,
+                search.params,
                 **sight,
                 callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
                 **options,
             )
     seconds = time.perf_counter() - start
+    found = search.kept(found)
     of_all = [held] if corr is not None else [one.symmetries for one in parts]
-    if not all(one.is_none for one in of_all):
-        found = found.canonical(of_all)
     for warning in found.warnings:
         warn(warning)
     show(found, seconds)
@@ -161,7 +193,10 @@ def register(
             "scene_sha256": sha256(scene),
         }
         recorded = search.recorded(*of_all) | ({} if corr is None else {"corr": str(corr)})
-        write_json(output, as_dict(found, seconds, **files, search=recorded))
+        if output.suffix.lower() == ".csv":
+            found.save(output)
+        else:
+            write_json(output, as_dict(found, seconds, **files, search=recorded, unit=unit))
     if bop is not None:
         of_parts = [found.of(i) for i in range(len(models))]
         rows = [(0, 0, np.asarray(one), [pose.score for pose in one], seconds) for one in of_parts]
@@ -169,7 +204,11 @@ def register(
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes
-        ibi.plot.instances(tgt, src, found, plot, title=title)
+        ibi.plot.instances(tgt if corr is not None else scan.points, src, found, plot, title=title)
+    if html is not None:
+        clouds = [src] if corr is not None else [one.points for one in parts]
+        seen = tgt if corr is not None else scan.points
+        ibi.plot.html(seen, clouds if len(clouds) > 1 else src, found, html, title=scene.name, unit=unit)
     if rerun is not None:
         if corr is None:  # once more, as `detect` keeps them to itself
             matches = part.correspond(tgt, **sight, num_threads=threads)
@@ -211,12 +250,12 @@ def _with_matches(
         if search.viewpoint is not None:
             warn("--viewpoint has no say where MODEL or SCENE has no normals")
     # A scan's camera is at its origin unless it is said to be elsewhere; but is this a scan?
-    is_scan = search.viewpoint is not None or (search.params is not None and search.params.oriented_normals)
+    is_scan = search.viewpoint is not None or search.changes.on(ibi.Params()).oriented_normals
     has_eye = tgt_normals is not None and is_scan
     found = ibi.Model(src, normals=src_normals, symmetries=held).register(
         tgt,
         pairs,
-        search.params or (ibi.Params.single_view() if has_eye else ibi.Params()),
+        search.changes.on(ibi.Params.single_view() if has_eye else ibi.Params()),
         tgt_normals=tgt_normals,
         viewpoint=(search.viewpoint or (0.0, 0.0, 0.0)) if has_eye else None,
         **options,

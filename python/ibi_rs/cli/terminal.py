@@ -62,7 +62,7 @@ class _Group(TyperGroup):
             return super().invoke(ctx)
 
 
-_NUMBERS = {"--viewpoint": 3, "--crop": 6}
+_NUMBERS = {"--viewpoint": 3, "--crop": 6}  # --camera is numbers or a file
 
 
 class _Command(TyperCommand):

@@ -15,13 +15,26 @@ import numpy as np
 import numpy.typing as npt
 
 from ibi_rs._core import InputError, measured_rows
+from ibi_rs._files import read_npy
 from ibi_rs._inputs import _number
 from ibi_rs._view import _intrinsics, depth_points
 
-from . import _arrays, _clouds, _columns, _meshes, _ply
+from . import _arrays, _cameras, _clouds, _columns, _meshes, _ply
+from ._cameras import Camera
 from ._reading import Floats, PathLike, Rows, extra, reading
 
-__all__ = ["Scan", "read_cloud", "read_depth", "read_mesh", "read_scan", "read_viewpoint"]
+__all__ = [
+    "Camera",
+    "Scan",
+    "read_camera",
+    "read_cloud",
+    "read_depth",
+    "read_mesh",
+    "read_scan",
+    "read_viewpoint",
+]
+
+IMAGES = (".png", ".tif", ".tiff")
 
 _READERS: dict[str, Callable[[Path], Rows]] = {
     **dict.fromkeys(_meshes.SUFFIXES, _meshes.vertices),
@@ -161,8 +174,35 @@ def read_viewpoint(path: PathLike) -> Floats | None:
     return None if read is None else reading(path, lambda: read(path))
 
 
+def read_camera(path: PathLike, image: PathLike | None = None) -> Camera:
+    """Read a pinhole camera: JSON as BOP, RealSense, Open3D or ROS (``CameraInfo``) have it.
+
+    Parameters
+    ----------
+    path : path
+        ``fx``, ``fy`` and ``cx``, ``cy`` or ``ppx``, ``ppy``; or ``K``, ``cam_K``, ``camera_matrix`` (by
+        rows) or ``intrinsic_matrix`` (by columns). ``depth_scale`` is taken for metres beside ``ppx``, else
+        for millimetres.
+    image : path, optional
+        The depth image: BOP's ``scene_camera.json`` has a camera for each, by its number.
+
+    Returns
+    -------
+    Camera
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or holds no pinhole camera, or several and none for the image.
+    """
+    path = Path(path)
+    return reading(path, lambda: _cameras.camera(path, None if image is None else Path(image)))
+
+
 def _scan(path: Path, readers: dict[str, Callable[[Path], Rows]]) -> Scan:
     suffix = path.suffix.lower()
+    if suffix in IMAGES:
+        raise InputError(f"{path}: is an image; with a camera read_depth reads it, or ibi with --camera")
     if suffix not in readers:
         raise InputError(f"{path}: clouds are read from {', '.join(sorted(readers))}, not from '{suffix}'")
     rows = reading(path, lambda: readers[suffix](path))
@@ -184,8 +224,8 @@ def read_depth(
     Parameters
     ----------
     path : path
-        PNG or TIFF with one channel. Pixels of 0, those that are not finite and, of 16 bits, those of the
-        largest value have no depth.
+        PNG or TIFF with one channel, or an NPY file of (H, W) numbers. Pixels of 0, those that are not
+        finite and, of 16 bits, those of the largest value have no depth.
     fx, fy, cx, cy : float
         Focal lengths (above 0) and principal point of the pinhole camera, pixels.
     scale, offset : float
@@ -212,6 +252,11 @@ def read_depth(
         raise InputError(f"scale and offset are {scale:g} and {offset:g}; scale must be above 0, both finite")
 
     def read() -> tuple[npt.NDArray[Any], bool]:
+        if path.suffix.lower() == ".npy":
+            array = read_npy(path)
+            if array.dtype.kind not in "fiu":
+                raise InputError(f"holds {array.dtype}; depths are numbers")
+            return array, array.dtype == np.uint16
         with extra("PIL.Image").open(path) as image:
             # Some versions of Pillow hold the 16 bits of a PNG in 32.
             has_16_bits = (image.format == "PNG" and image.mode != "L") or image.mode.startswith("I;16")
