@@ -35,12 +35,12 @@ DETECT = ibi.Detector(MODEL, max_instances=1)
 
 
 def test_a_row_is_a_pose():
-    rows = DETECT(batch([0, 1, 2]))
-    assert rows["scan_id"].tolist() == ["scan 0", "scan 1", "scan 2"]
+    rows = DETECT(batch([1, 2, 3]))
+    assert rows["scan_id"].tolist() == ["scan 1", "scan 2", "scan 3"]
     assert {name: column.dtype.kind for name, column in rows.items()} == {
         "scan_id": "U", "model": "U", "score": "f", "target_from_source": "f", "error": "U",
     }  # fmt: skip
-    for seed, pose, score in zip(range(3), rows["target_from_source"], rows["score"], strict=True):
+    for seed, pose, score in zip(range(1, 4), rows["target_from_source"], rows["score"], strict=True):
         points, place = scan(seed)
         assert ibi.metrics.add_s(BOX[0], pose, place) < 4
         alone = MODEL.detect(points, viewpoint=[0, 0, 0], max_instances=1)

@@ -21,7 +21,9 @@ def recording(path):
 
 WRITERS = {
     "poses.json": lambda path: cli.outputs.write_json(path, {"poses": []}),
-    "poses.csv": lambda path: cli.outputs.write_bop(path, [(0, 0, np.asarray(FOUND), [1.0, 1.0], 0.1)]),
+    "poses.csv": lambda path: cli.outputs.write_bop(
+        path, [(0, 0, np.asarray(FOUND), [1.0, 1.0], 0.1)], mm=1.0
+    ),
     "found.png": lambda path: ibi.plot.instances(SCENE.tgt, SCENE.src, FOUND, path),
     "found.pdf": lambda path: ibi.plot.instances(SCENE.tgt, SCENE.src, FOUND, path),
     "found.rrd": recording,

@@ -113,7 +113,7 @@ MinScore = Annotated[
 Unit = Annotated[
     str | None,
     typer.Option(
-        help=f"What MODEL and the scan are in: {', '.join(METRES)}. For the JSON, and for the millimetres of --bop, "
+        help=f"What MODEL and the scan are in: {', '.join(METRES)}. For the JSON, and for the mm of --bop, "
         "which otherwise takes parts below 1 across to be in m, and above 10 in mm."
     ),
 ]

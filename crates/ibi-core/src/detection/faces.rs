@@ -25,6 +25,13 @@ const FLAT_COS: f64 = 0.97;
 /// Fewer points are no face.
 const MIN_ROWS: usize = 20;
 
+/// The mean of the unit normals of a face is at least so long: that of a strip of a cylinder that was followed for as far as it has the
+/// normal is shorter, and so it is where noise has all kinds of normals look alike.
+const PLANE_MEAN: f64 = 0.994;
+
+/// Of the diameter of a model: however small its faces are, what is not larger than this may be of it.
+const LEAST_FACE: f64 = 0.5;
+
 /// A face is fitted anew each time that it has grown by as much.
 const REFIT: f64 = 1.5;
 
@@ -96,7 +103,8 @@ pub(super) fn faces(
                 refit = (REFIT * rows.len() as f64) as usize;
             }
         }
-        if rows.len() >= MIN_ROWS {
+        let sum: Vector3<f64> = rows.iter().map(|&row| normals[row as usize]).sum();
+        if rows.len() >= MIN_ROWS && sum.norm() >= PLANE_MEAN * rows.len() as f64 {
             let extents = Plane::of(points, &rows, &plane.normal).1;
             found.push(Face { rows, extents });
         }
@@ -104,10 +112,12 @@ pub(super) fn faces(
     Some(found)
 }
 
-/// Whether a face in a scan, thinned to a voxel, is larger than each of those of a model.
-pub(super) fn is_larger(extents: [f64; 2], than: &[[f64; 2]], voxel: f64) -> bool {
+/// Whether a face in a scan, thinned to a voxel, is larger than each of those of models; `diameter`: of the largest.
+pub(super) fn is_larger(extents: [f64; 2], than: &[[f64; 2]], diameter: f64, voxel: f64) -> bool {
     let margin = MARGIN_VOXELS * voxel;
-    than.iter().all(|of| (0..2).any(|k| extents[k] > LARGER * of[k] + margin))
+    than.iter()
+        .chain([&[LEAST_FACE * diameter; 2]])
+        .all(|of| (0..2).any(|k| extents[k] > LARGER * of[k] + margin))
 }
 
 #[derive(Clone, Copy)]

@@ -173,7 +173,9 @@ impl Prepared {
         if setting.remove_plane != Some(false) {
             let found = faces(&points, &normals, voxel, interrupt).ok_or(FeatureError::Interrupted)?;
             let mut stays = vec![true; points.len()];
-            for face in found.iter().filter(|face| is_larger(face.extents, setting.faces, voxel)) {
+            for face in
+                found.iter().filter(|face| is_larger(face.extents, setting.faces, setting.diameter, voxel))
+            {
                 face.rows.iter().for_each(|&row| stays[row as usize] = false);
             }
             let rows: Vec<usize> = (0..points.len()).filter(|&row| stays[row]).collect();

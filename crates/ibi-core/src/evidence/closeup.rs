@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
 
 use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
-use super::noise::noise_of_rays;
+use super::noise::{noise_of_rays, spacing_of_rays};
 use super::odds::{BLURRED, Measures};
 use super::rays::{Rays, visible};
 use super::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
@@ -98,9 +98,7 @@ impl Closeup {
         let voxel = VOXELS_PER_SPACING * scene.resolution;
         // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
         let noise = noise_of_rays(&rays[0], &scene.target.points);
-        let points = &scene.target.points;
-        let distance = points.iter().map(|p| (p - rays[0].eye()).norm()).sum::<f64>() / points.len() as f64;
-        let blur = noise / voxel * (distance * rays[0].spacing() / voxel);
+        let blur = noise / voxel * (spacing_of_rays(&rays[0], &scene.target.points, voxel) / voxel);
         if blur >= BLURRED && of_all.is_none() {
             return None;
         }

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
-use super::rays::Rays;
+use super::rays::{MAX_ANGLE, Rays};
 use crate::kernels::nearby::Nearby;
 
 /// Points that a plane is laid through.
@@ -31,7 +31,26 @@ pub fn noise_of_rays(rays: &Rays, points: &[Point3<f64>]) -> f64 {
     median_roughness(points, around)
 }
 
-/// The same of a scan that no single eye made: of the 12 nearest points, within the reach of `nearby`, which holds the points.
+/// How far apart the points are that an eye measured, on surfaces as it sees them: as if those within `radius` of some `points`, the median
+/// of their numbers, filled the disc. Pixels without a depth are none. Infinite where there are no points.
+#[must_use]
+pub fn spacing_of_rays(rays: &Rays, points: &[Point3<f64>], radius: f64) -> f64 {
+    let some = points.iter().step_by(points.len().div_ceil(SAMPLE).max(1));
+    let around = |point: &Point3<f64>| {
+        let to = point - rays.eye();
+        let mut count = 0.0;
+        rays.each_near(point, (radius / to.norm()).min(MAX_ANGLE), |end, _| {
+            count += f64::from(u8::from((end - to).norm() <= 2.0 * radius));
+        });
+        count
+    };
+    let mut counts: Vec<f64> = some.map(around).collect();
+    let middle = counts.len() / 2;
+    let most = if counts.is_empty() { 0.0 } else { *counts.select_nth_unstable_by(middle, f64::total_cmp).1 };
+    (std::f64::consts::PI / most).sqrt() * radius
+}
+
+/// The same as [`noise_of_rays`] of a scan that no single eye made: of the 12 nearest points, within the reach of `nearby`, which holds the points.
 #[must_use]
 pub fn noise_of_cloud(points: &[Point3<f64>], nearby: &Nearby) -> f64 {
     let around = |point: &Point3<f64>| {

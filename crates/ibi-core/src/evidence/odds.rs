@@ -56,10 +56,10 @@ const SHARP: [f64; TERMS] = [-2.77, -26.9, -4.31, -35.9, 2.01, 0.0, 0.66, 2.24, 
 const FUSED: [f64; TERMS] = [-14.7, -9.6, -4.6, -45.3, 4.1, 2.0, 0.0, 3.3, 1.46, 0.47];
 
 /// Up to the first a scan is sharp, and from the second on a close look tells no more than the clouds; in between it counts in
-/// proportion. Bins of the tuning half have 0.09 at most. Coarse real scans of parts that are not quite the model's shape have 0.12 and
+/// proportion. Bins of the tuning half have 0.116 at most. Coarse real scans of parts that are not quite the model's shape have 0.158 and
 /// more: there a close look mistrusts every pose. (In ray-cast scans as coarse it is as sure as in sharp ones.)
-const BLUR: [f64; 2] = [0.1, BLURRED];
-pub(super) const BLURRED: f64 = 0.115;
+const BLUR: [f64; 2] = [0.12, BLURRED];
+pub(super) const BLURRED: f64 = 0.15;
 
 /// Of a loss the root: the step from none to a little tells most.
 fn held(loss: f64) -> f64 {
