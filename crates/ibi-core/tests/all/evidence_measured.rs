@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use ibi_core::evidence::contour::{Contour, Overrun, Placed, Rim, Scan, contour, overrun, run_on};
 use ibi_core::evidence::explained::{Reach, Shape, explained};
-use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays};
+use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays, spacing_of_rays};
 use ibi_core::evidence::odds::Measures;
 use ibi_core::evidence::rays::{MAX_ANGLE, MIN_FACING_COS, Rays, visible};
 use ibi_core::evidence::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
@@ -755,6 +755,21 @@ proptest! {
         prop_assume!(!cloud.iter().any(|point| is_tie_at_12(&cloud, point)));
         prop_assert!((found - expected).abs() < 1e-6 * (1.0 + expected), "{} and {}", found, expected);
     }
+}
+
+#[test]
+fn points_are_as_far_apart_as_pixels_that_measured_something() {
+    let spacing = |is_there: fn(usize) -> bool| {
+        let scan: Vec<_> = image(0.008, 0.25, |_, _| Some(3.0)).into_iter().enumerate().collect();
+        let scan: Vec<_> = scan.into_iter().filter(|(at, _)| is_there(*at)).map(|(_, p)| p).collect();
+        let rays = Rays::new(Point3::origin(), &scan).unwrap();
+        spacing_of_rays(&rays, &scan, 0.2)
+    };
+    let is = |a: f64, b: f64| assert!((a / b - 1.0).abs() < 0.05, "{a}, not {b}");
+    is(spacing(|_| true), 0.024);
+    is(spacing(|at| at % 2 == 0), 0.024 * 2_f64.sqrt());
+    let rays = Rays::new(Point3::origin(), &image(0.008, 0.25, |_, _| Some(3.0))).unwrap();
+    assert_eq!(spacing_of_rays(&rays, &[], 0.2), f64::INFINITY);
 }
 
 fn is_tie_at_12(cloud: &[Point3<f64>], point: &Point3<f64>) -> bool {
