@@ -181,3 +181,11 @@ def test_the_page_has_the_figures_of_the_record():
 
     table = markdown(records.read(records.RECORDS / RECORD))
     assert table in (root / "docs/features.md").read_text(encoding="utf-8"), "run benchmarks/detect.py --docs"
+
+
+@pytest.mark.parametrize("count", [3, 4, 1001])
+def test_numbers_at_the_end_of_the_floats_do_not_overflow(tee, count):
+    # Found by `make fuzz`: the mean of the middle two of an even number is beyond them.
+    points = np.full((count, 3), np.finfo(float).max / 2)
+    with pytest.raises(ibi.InputError, match="below 1e100"):
+        tee.detect(points, viewpoint=CAMERA)
