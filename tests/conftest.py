@@ -1,6 +1,14 @@
 """`--none-skipped`, for where all that is optional is installed: what would be skipped fails."""
 
+import signal
+
 import pytest
+
+
+def pytest_configure():
+    # A shell's background job has Ctrl-C ignored, and so have all that it starts.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser):
