@@ -36,7 +36,10 @@ def try_outputs(outputs: dict[str, Path | None], inputs: dict[str, Path | None])
         if path is None:
             continue
         if name == "--plot":
-            ibi.plot._format(path)
+            try:
+                ibi.plot._format(path)
+            except ibi.InputError as error:
+                misused(str(error))
         if name == "--html":
             ibi.plot._plotly()
         if name == "--rerun":

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from ibi_rs.datasets._scene import (
     Floats,
     Held,
     Kind,
+    Lazy,
     Part,
     Scene,
     folder,
@@ -34,7 +35,7 @@ _TARGETS = ("test_targets_bop19.json", "test_targets_bop24.json", "test_targets_
 _SUFFIXES = (".png", ".tif", ".tiff")
 
 
-class Bop(Sequence[Scene]):
+class Bop(Lazy[Scene]):
     """A data set in the folders of BOP: a sequence of images, each a :class:`Scene`.
 
     Lengths are millimetres. A scene's points are those of its depth image, in the frame of the camera, and
@@ -239,14 +240,7 @@ class Bop(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._targets)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        """Return an image, or several, in the order of their numbers."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
+    def _item(self, index: int) -> Scene:
         scene_id, im_id, objects = self._targets[index]
         truth = self._truth(scene_id, im_id)
         parts = []
@@ -257,10 +251,6 @@ class Bop(Sequence[Scene]):
         read = partial(self._scan, scene_id, im_id)
         name = f"{scene_id:06d}/{im_id:06d}"
         return Scene(name, tuple(parts), read, ids=(scene_id, im_id), has_truth=truth is not None)
-
-    def __iter__(self) -> Iterator[Scene]:
-        """Give all images, one by one; none is kept."""
-        return (self[i] for i in range(len(self)))
 
     def _truth(self, scene_id: int, im_id: int) -> list[tuple[int, Floats, float]] | None:
         """Give all labelled objects: number, pose, visible share."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +12,7 @@ import numpy.typing as npt
 from ibi_rs import io
 from ibi_rs._core import InputError
 from ibi_rs._inputs import _frozen
-from ibi_rs.datasets._scene import Floats, Kind, folder
+from ibi_rs.datasets._scene import Floats, Kind, Lazy, folder
 from ibi_rs.io._reading import PathLike
 
 
@@ -30,7 +29,7 @@ class _Shape(Kind):
         return _frozen((vertices - centre) / radius), _frozen(faces)
 
 
-class ModelNet40(Sequence[Kind]):
+class ModelNet40(Lazy[Kind]):
     """The meshes of ModelNet, scaled into the unit sphere: a sequence of :class:`Kind`, each "chair_0001".
 
     There are no scenes: place copies with :mod:`ibi_rs.synth`. The middle of a mesh's box is at the origin,
@@ -78,20 +77,9 @@ class ModelNet40(Sequence[Kind]):
     def __len__(self) -> int:
         return len(self._files)
 
-    @overload
-    def __getitem__(self, index: int) -> Kind: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Kind]: ...
-    def __getitem__(self, index: int | slice) -> Kind | Sequence[Kind]:
-        """Return a mesh, or several, in the order of their names."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
+    def _item(self, index: int) -> Kind:
         path = self._files[index]
         return _Shape(path.stem, path)
-
-    def __iter__(self) -> Iterator[Kind]:
-        """Give all, one by one; none is kept."""
-        return (self[i] for i in range(len(self)))
 
     def __repr__(self) -> str:
         return f"ModelNet40({self.root}: {len(self)} meshes)"

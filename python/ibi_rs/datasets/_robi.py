@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from ibi_rs.datasets._scene import (
     Floats,
     Held,
     Kind,
+    Lazy,
     Part,
     Scene,
     folder,
@@ -29,7 +29,7 @@ from ibi_rs.io._reading import PathLike, reading
 _LENS = ("fx", "fy", "cx", "cy", "depth_unit")
 
 
-class Robi(Sequence[Scene]):
+class Robi(Lazy[Scene]):
     """The views of one object in ROBI: a sequence of depth images, each a :class:`Scene`.
 
     Lengths are millimetres; points are in the frame of the camera. ``ids`` are the numbers of scene and view.
@@ -92,14 +92,7 @@ class Robi(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._views)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        """Return a view, or several, in the order of their numbers."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
+    def _item(self, index: int) -> Scene:
         scene, view = self._views[index]
         image = self._depth(scene) / f"DEPTH_view_{view}.png"
         world_from_camera = _pose(image.with_suffix(".json"), "cam_pose")
@@ -109,10 +102,6 @@ class Robi(Sequence[Scene]):
         part = Part(self._kind, poses, np.full(len(poses), np.nan))
         read = partial(_scan, image, self._lens)
         return Scene(f"{self.root.name}/Scene_{scene}/view_{view}", (part,), read, ids=(scene, view))
-
-    def __iter__(self) -> Iterator[Scene]:
-        """Give all views, one by one; none is kept."""
-        return (self[i] for i in range(len(self)))
 
     def __repr__(self) -> str:
         return f"Robi({self.root.name}, {self._sensor}: {len(self)} views)"

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +15,7 @@ from ibi_rs.datasets._scene import (
     Floats,
     Held,
     Kind,
+    Lazy,
     Part,
     Scene,
     folder,
@@ -36,7 +36,7 @@ _ROUND = 0.05
 """How far the scales of the two axes across may be apart where a quarter turn leaves a model the same."""
 
 
-class Scan2Cad(Sequence[Scene]):
+class Scan2Cad(Lazy[Scene]):
     """Rooms with several copies of one model: a sequence, a :class:`Scene` for each room and model.
 
     Lengths are metres, in the frame of the scan's mesh, whose vertices are the points, with their normals.
@@ -153,22 +153,11 @@ class Scan2Cad(Sequence[Scene]):
     def __len__(self) -> int:
         return len(self._found)
 
-    @overload
-    def __getitem__(self, index: int) -> Scene: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Scene]: ...
-    def __getitem__(self, index: int | slice) -> Scene | Sequence[Scene]:
-        """Return a room and a model in it, or several."""
-        if isinstance(index, slice):
-            return [self[i] for i in range(len(self))[index]]
+    def _item(self, index: int) -> Scene:
         room, kind, poses = self._found[index]
         path = self._mesh(room) or self._scans / room / _MESHES[0].format(room)
         part = Part(kind, poses, np.full(len(poses), np.nan))
         return Scene(f"{room}/{kind.name}", (part,), partial(_surface, path))
-
-    def __iter__(self) -> Iterator[Scene]:
-        """Give all, one by one; none is kept."""
-        return (self[i] for i in range(len(self)))
 
     def __repr__(self) -> str:
         return f"Scan2Cad({len({room for room, _, _ in self._found})} rooms, {len(self)} scenes)"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,29 @@ from ibi_rs._view import View
 from ibi_rs.symmetries import Symmetries
 
 Floats = npt.NDArray[np.float64]
+Item = TypeVar("Item")
+
+
+class Lazy(Sequence[Item]):
+    """A sequence whose items are made when they are asked for, and not kept."""
+
+    @abstractmethod
+    def _item(self, index: int) -> Item:
+        """Make one."""
+
+    @overload
+    def __getitem__(self, index: int) -> Item: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Item]: ...
+    def __getitem__(self, index: int | slice) -> Item | Sequence[Item]:
+        """Return one, or several."""
+        if isinstance(index, slice):
+            return [self._item(i) for i in range(len(self))[index]]
+        return self._item(index)
+
+    def __iter__(self) -> Iterator[Item]:
+        """Give all, one by one; none is kept."""
+        return (self._item(i) for i in range(len(self)))
 
 
 class Kind:
