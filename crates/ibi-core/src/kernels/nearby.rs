@@ -605,6 +605,9 @@ const CELL_PER_SPACING: f32 = 3.0;
 const SPACING_SAMPLE: usize = 8192;
 const GUESS_SAMPLE: usize = 64;
 
+/// Coordinates that one thread puts into the order of a grid at a time.
+const GATHER_GRAIN: usize = 1 << 16;
+
 /// Points that one thread asks at a time.
 const SPACING_GRAIN: usize = 1024;
 
@@ -632,9 +635,10 @@ impl Sorted {
     }
 
     fn columns_of(rows: &[Vec<f32>; 3], grid: &Grid) -> [Vec<f32>; 3] {
+        let order = grid.order();
         rows.each_ref().map(|axis| {
-            let sorted = grid.order().iter().map(|&i| axis[i as usize]);
-            sorted.chain([f32::INFINITY; LANES]).collect()
+            let at = |i: usize| order.get(i).map_or(f32::INFINITY, |&row| axis[row as usize]);
+            par::map(order.len() + LANES, GATHER_GRAIN, at)
         })
     }
 
