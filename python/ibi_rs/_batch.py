@@ -7,6 +7,7 @@ import operator
 import os
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
@@ -25,6 +26,7 @@ import numpy as np
 
 from ibi_rs._inputs import _count, _num_threads
 from ibi_rs._job import Job, JobError
+from ibi_rs._log import LOGGER
 from ibi_rs.registration import Registration
 
 _T = TypeVar("_T")
@@ -236,7 +238,7 @@ class _Batch(Generic[_T, _R]):
     ) -> None:
         self._call, self._items, self._make, self._is_ours = call, iter(items), make, is_ours
         self._window, self._retries, self._callback, self._stop = window, retries, callback, stop
-        self._num_taken = 0
+        self._num_taken = self._num_failed = 0
         self._is_empty = False
         self._failure: Exception | None = None  # of the iterable itself
         self._running: dict[Future[_R], _Task[_T]] = {}
@@ -245,7 +247,7 @@ class _Batch(Generic[_T, _R]):
 
     def __iter__(self) -> Iterator[_R | JobError]:
         self._executor = self._make()
-        turn = 0
+        turn, start = 0, time.perf_counter()
         try:
             while True:
                 self._fill()
@@ -256,6 +258,10 @@ class _Batch(Generic[_T, _R]):
                     self._collect()
                 elif self._is_empty and not self._suspects:
                     break
+            LOGGER.info(
+                "batch: %d jobs, %d failed, %.3f s",
+                *(turn, self._num_failed, time.perf_counter() - start),
+            )
             if self._failure is not None:
                 raise self._failure
         finally:
@@ -326,6 +332,7 @@ class _Batch(Generic[_T, _R]):
             self._executor = self._make()
 
     def _run_again(self, task: _Task[_T], error: Exception) -> None:
+        LOGGER.debug("batch: job %d lost its worker: %s", task.index, error)
         task.num_crashes += task.is_suspect
         if task.num_crashes > self._retries:
             self._finish(task, self._as_value(task, error))
@@ -339,5 +346,10 @@ class _Batch(Generic[_T, _R]):
 
     def _finish(self, task: _Task[_T], value: _R | JobError) -> None:
         self._done[task.index] = value
+        if isinstance(value, JobError):
+            self._num_failed += 1
+            LOGGER.warning("batch: %s", value)
+        else:
+            LOGGER.debug("batch: job %d is done", task.index)
         if self._callback is not None:
             self._callback(task.index, value)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from ibi_rs import _core, _precision
+from ibi_rs import _core, _log, _precision
 from ibi_rs._box import Box
 from ibi_rs._inputs import (
     Points,
@@ -171,6 +171,10 @@ class Model:
         model._points, model._frames = _frozen(model._core.points()), None
         normals = model._core.normals()
         model._normals = None if normals is None else _frozen(normals)
+        _log.LOGGER.debug(
+            "model: %d points on %d faces, voxel %s, %s",
+            *(len(model), len(mesh[1]), significant(model.voxel), model.symmetries),
+        )
         return model
 
     @property
@@ -276,7 +280,14 @@ class Model:
             Those of :meth:`detect`.
         """
         scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
-        return Matches._of(_core.correspond(self._core, **scan))
+        matches = Matches._of(_core.correspond(self._core, **scan))
+        for warning in matches.warnings:
+            _log.LOGGER.warning("correspond: %s", warning)
+        _log.LOGGER.info(
+            "correspond: %d points of %d left, thinned to a voxel of %s; %d correspondences",
+            *(len(matches.tgt), len(scan["tgt"]), significant(matches.voxel), len(matches.corr)),
+        )
+        return matches
 
     def detect(
         self,
@@ -369,7 +380,9 @@ class Model:
         )
         if raw["resolution_set"] != params.resolution:
             params = params.replace(resolution=raw["resolution_set"])
-        return self._turned(Registration._of(raw, params), reference)
+        found = Registration._of(raw, params)
+        _log.ended("detect", f"{len(scan['tgt'])} points, {len(found.labels)} correspondences", found)
+        return self._turned(found, reference)
 
     def register(
         self,
@@ -412,7 +425,9 @@ class Model:
             on_round=None if callback is None else on_round(callback),
             own=own_stages(params._own(), params.seed, self._points, target, pairs),
         )
-        return self._turned(Registration._of(raw, params), reference)
+        found = Registration._of(raw, params)
+        _log.ended("register", f"{len(target)} points, {len(pairs)} correspondences", found)
+        return self._turned(found, reference)
 
     def _turned(self, found: Registration, reference: Any) -> Registration:
         """Of the poses that look the same give those turned least."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ibi_rs import _core
+from ibi_rs import _core, _log
 from ibi_rs._box import Box
 from ibi_rs._inputs import Points
 from ibi_rs._matches import scan_arguments
@@ -162,6 +162,8 @@ class Models(Sequence[Model]):
         found = [Registration._of_part(raw, params, i, self._names[i]) for i, raw in enumerate(parts)]
         why = StopReason._of(reason, message)
         all_found = Registration._of_parts(self._names, found, ranking, params, why, total_s)
+        of = f"{len(self)} models, {len(scan['tgt'])} points, {len(all_found.labels)} correspondences"
+        _log.ended("detect", of, all_found)
         held = [part.symmetries for part in self._parts]
         return all_found if all(one.is_none for one in held) else all_found.canonical(held, reference)
 

@@ -53,6 +53,7 @@ from .search import (
 )
 from .terminal import (
     MAX_THREADS,
+    Verbose,
     command,
     err,
     misused,
@@ -104,6 +105,7 @@ def batch(
             help="Leave out scans whose JSON is there and would come out the same: resume a batch.",
         ),
     ] = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Find the parts MODEL in each of SCENES, several at a time.
 

@@ -27,7 +27,7 @@ from ibi_rs.datasets import BopImage
 
 from .outputs import sha256
 from .search import MaxInstances, ParamsFile, Preset, TimeoutS, Voxel, changes_of
-from .terminal import MAX_THREADS, command, err, misused, out, say
+from .terminal import MAX_THREADS, Verbose, command, err, misused, out, say
 
 _WINDOW = 4
 """Images under way for each worker."""
@@ -69,6 +69,7 @@ def bop(
         str | None,
         typer.Option(help="Run there: 'ray', ray://HOST:PORT, or tcp://HOST:PORT of a scheduler of Dask."),
     ] = None,
+    verbose: Verbose = 0,
 ) -> None:
     """Find all objects in all images of a data set of BOP, and score what was found.
 

@@ -49,8 +49,9 @@ from .search import (
 from .terminal import (
     FOUND_NOTHING,
     MAX_THREADS,
+    Progress,
+    Verbose,
     command,
-    err,
     misused,
     out,
     warn,
@@ -99,6 +100,7 @@ def register(
         Path | None,
         typer.Option(help="A recording (RRD) of parts, matches and rounds; `rerun FILE` plays it."),
     ] = None,
+    verbose: Verbose = 0,
 ) -> None:
     """Find the parts MODEL in SCENE and print a table of their poses.
 
@@ -153,11 +155,12 @@ def register(
     try_outputs(outputs, {**inputs, "SCENE": scene, "--corr": corr, "--params": params})
     options = search.limits(threads)
     pairs: Any = None
-    with err.status("reading") as status:
+    with Progress("reading") as progress:
         if corr is not None:
             tgt, tgt_normals = io.read_cloud(scene)
             pairs = _pairs(corr)
             mm = 0.0 if bop is None else millimetres(unit, metrics.diameter(io.read_cloud(model)[0]))
+            progress.update("registering")
             src, held, found = _with_matches(search, model, tgt, tgt_normals, pairs, options)
         else:
             scan = search.read(scene)
@@ -166,13 +169,13 @@ def register(
             mm = 0.0 if bop is None else millimetres(unit, *(one.diameter for one in parts))
             tgt, sight = search.look(scan, min(one.voxel for one in parts))
             src, held = part.points, part.symmetries
-            status.update("detecting")
+            progress.update("detecting")
             kinds = part if len(parts) == 1 else ibi.Models(parts, names=_names(models))
             found = kinds.detect(
                 tgt,
                 search.params,
                 **sight,
-                callback=lambda done: status.update(f"detecting: round {done.index + 1}"),
+                callback=lambda done: progress.update(f"detecting: round {done.index + 1}"),
                 **options,
             )
     seconds = time.perf_counter() - start

@@ -15,6 +15,7 @@ from ibi_rs import features, io, metrics
 from ibi_rs import params as parameters
 from ibi_rs._files import read_npy
 from ibi_rs._inputs import _num_threads
+from ibi_rs._log import LOGGER
 from ibi_rs._written import METRES, checked_unit
 from ibi_rs.symmetries import _bop_entry as bop_entry
 
@@ -311,6 +312,7 @@ class Search:
         is_left = _without_planes(scan.points, voxel, self.remove_planes, self.crop, sight["viewpoint"])
         if not is_left.any():
             raise ibi.InputError(f"--remove-planes {self.remove_planes}: nothing of the scan is left")
+        LOGGER.info("--remove-planes: %d points of %d taken away", (~is_left).sum(), len(is_left))
         sight["remove_plane"] = False
         if sight["viewpoint"] is not None:
             sight["viewpoint"] = ibi.View(sight["viewpoint"], scan.points)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import signal
 import sys
@@ -17,8 +18,10 @@ from ibi_rs._inputs import _MAX_THREADS
 
 try:
     with _interrupts.held():
+        import rich.progress
         import typer
         from rich.console import Console
+        from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
         from typer.core import TyperCommand, TyperGroup
 except ImportError as error:
     raise SystemExit(f"ibi: the command needs more: pip install 'ibi_rs[cli]' ({error})") from None
@@ -166,6 +169,90 @@ def misused(text: str) -> NoReturn:
     fail(text, 2)
 
 
+class _Said(logging.Handler):
+    """Prints what runs log, but for what the commands say by themselves: warnings and errors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.addFilter(lambda record: record.levelno < logging.WARNING)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(self.format(record))
+
+
+def _listen(ctx: typer.Context, count: int) -> int:
+    """Print what runs log until the command ends."""
+    logger = logging.getLogger("ibi_rs")
+    is_on = any(isinstance(handler, _Said) for handler in logger.handlers)
+    if count and not is_on:  # before the command's name, or behind it, or both
+        handler, before = _Said(), logger.level
+
+        def end() -> None:
+            logger.removeHandler(handler)
+            logger.setLevel(before)
+
+        ctx.call_on_close(end)
+        logger.addHandler(handler)
+    if count:
+        logger.setLevel(logging.INFO if count == 1 else logging.DEBUG)
+    return count
+
+
+Verbose = Annotated[
+    int,
+    typer.Option(
+        "-v",
+        "--verbose",
+        count=True,
+        callback=_listen,
+        show_default=False,
+        metavar="",
+        help="Tell on stderr what is done; -vv tells more.",
+    ),
+]
+
+
+class Progress:
+    """Says on a terminal what is being done, once that takes longer than a moment.
+
+    Attributes
+    ----------
+    MOMENT_S : float
+        Seconds without a word.
+    """
+
+    MOMENT_S = 1.0
+
+    def __init__(self, what: str) -> None:
+        columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+        # Results are printed to stdout: they are not to go where this is.
+        options: dict[str, Any] = {"transient": True, "redirect_stdout": False}
+        self._shown = rich.progress.Progress(*columns, console=err, disable=not err.is_terminal, **options)
+        self._task = self._shown.add_task(what, total=None)
+        self._lock, self._is_over = threading.Lock(), False
+        self._timer = threading.Timer(self.MOMENT_S, self._show)
+        self._timer.daemon = True
+
+    def __enter__(self) -> Progress:
+        self._timer.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._timer.cancel()
+        with self._lock:  # the timer may be at it
+            self._is_over = True
+            self._shown.stop()
+
+    def update(self, what: str) -> None:
+        """Say what is being done now."""
+        self._shown.update(self._task, description=what)
+
+    def _show(self) -> None:
+        with self._lock:
+            if not self._is_over:
+                self._shown.start()
+
+
 app = typer.Typer(
     cls=_Group,
     add_completion=False,
@@ -187,6 +274,7 @@ err = Printer(stderr=True, emoji=False)  # a file may be called scan:x:
 @app.callback(invoke_without_command=True)
 def main(
     version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+    verbose: Verbose = 0,
 ) -> None:
     """Find every copy of a part in a scan: poses in six degrees of freedom."""
     if version:
