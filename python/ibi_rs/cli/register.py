@@ -90,7 +90,11 @@ def register(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Poses as JSON, or as .csv.")] = None,
     bop: Annotated[Path | None, typer.Option(help="Poses as BOP's CSV: t in mm.")] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="A picture (PNG, PDF ...): the scene grey, each part in a colour.")
+        Path | None,
+        typer.Option(
+            help="A picture (PNG, PDF ...): the scene grey, each part in a colour; with --camera the depth "
+            "image, with outlines."
+        ),
     ] = None,
     html: Annotated[
         Path | None,
@@ -207,7 +211,13 @@ def register(
     if plot is not None:
         title = f"{scene.name}: {len(found)} x {model.name}".replace("$", r"\$")  # else it is a formula
         title = title.encode(errors="replace").decode()  # names of files may be of any bytes
-        ibi.plot.instances(tgt if corr is not None else scan.points, src, found, plot, title=title)
+        if camera is not None:
+            mesh = io.read_mesh(model)
+            ibi.plot.outlines(scan.points, search.camera_of(scene), mesh, found, plot, title=title, unit=unit)
+        else:
+            eye = viewpoint if corr is not None else search.sight(None, scan.viewpoint)["viewpoint"]
+            seen = tgt if corr is not None else scan.points
+            ibi.plot.instances(seen, src, found, plot, title=title, unit=unit, viewpoint=eye)
     if html is not None:
         clouds = [src] if corr is not None else [one.points for one in parts]
         seen = tgt if corr is not None else scan.points

@@ -289,20 +289,23 @@ class Search:
         """Read a scan, or the depth image of a camera."""
         if self.camera is None:
             return io.read_scan(path)
-        metres = 0.001
-        if self._numbers is not None:
-            fx, fy, cx, cy = self._numbers
-            camera = io.Camera(fx, fy, cx, cy)
-        else:
-            camera = io.read_camera(self.camera, path)
-            metres = metres if camera.metres is None else camera.metres
-            if camera.is_distorted:
-                warn(f"{self.camera}: names distortions, which are not undone; give rectified images")
+        camera = self.camera_of(path)
+        metres = 0.001 if camera.metres is None else camera.metres
+        if camera.is_distorted:
+            warn(f"{self.camera}: names distortions, which are not undone; give rectified images")
         scale = metres / METRES[self.unit or "m"] if self.depth_scale is None else 1 / self.depth_scale
         if self.depth_scale is None and camera.metres is None and _is_of_floats(path):
             scale = 1.0
         points = io.read_depth(path, camera.fx, camera.fy, camera.cx, camera.cy, scale=scale)
         return io.Scan(points, None, np.zeros(3), 0)
+
+    def camera_of(self, path: Path) -> io.Camera:
+        """Return that of --camera, of the depth image of a path."""
+        assert self.camera is not None
+        if self._numbers is None:
+            return io.read_camera(self.camera, path)
+        fx, fy, cx, cy = self._numbers
+        return io.Camera(fx, fy, cx, cy)
 
     def look(self, scan: io.Scan, voxel: float) -> tuple[Any, dict[str, Any]]:
         """Return the points to be searched, and the arguments of `Model.detect` that go with them."""
