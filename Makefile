@@ -137,6 +137,10 @@ docs: $(STAMPS)/package $(STAMPS)/group-docs ## build the documentation into doc
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build
 	@echo "open docs/_build/index.html"
 
+.PHONY: gallery
+gallery: $(STAMPS)/package $(STAMPS)/group-cli ## run examples/gallery and draw the pictures of docs/gallery.md
+	for scene in examples/gallery/*.py; do $(BIN)/python $$scene; done
+
 .PHONY: wheel
 wheel: cargo $(STAMPS)/venv ## build a wheel into dist
 	$(BIN)/maturin build --release --out dist
