@@ -22,5 +22,5 @@ Image.fromarray(steps).save(FOLDER / "depth.png")
 numbers = {name: round(getattr(camera, name), 4) for name in ("fx", "fy", "cx", "cy")}
 (FOLDER / "camera.json").write_text(json.dumps(numbers | {"depth_scale": 0.1}, indent=1) + "\n")
 in_sight = scene.visibility > 0.5
-truth = {"unit": "mm", "poses": scene.poses[in_sight].round(4).tolist()}
+truth = {"unit": "mm", "poses": scene.poses[in_sight].round(9).tolist()}
 (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
