@@ -1,8 +1,11 @@
 """Stages of the user's own: the results of the variants they mirror, what is refused, and how they end."""
 
 import copy
+import json
 import os
 import pickle
+import subprocess
+import sys
 import threading
 import time
 import traceback
@@ -591,3 +594,22 @@ def test_types_help(tmp_path):
         os.environ.pop("MYPYPATH") if before is None else os.environ.update(MYPYPATH=before)
     assert fine[2] == 0, fine[0]
     assert bad[0].count("[arg-type]") == 3, bad[0]
+
+
+def test_types_help_in_editors_too(tmp_path):
+    """Pyright, as the server of many editors is."""
+    pytest.importorskip("basedpyright")
+    (tmp_path / "pyrightconfig.json").write_text(
+        json.dumps({"typeCheckingMode": "standard", "extraPaths": [str(Path(ibi.__file__).parents[1])]})
+    )
+    wrong = ["ibi.Params(te=hv)", "ibi.Params(hv=scs)", "ibi.Params(te='mak')"]
+    (tmp_path / "page.py").write_text(TYPED)
+    (tmp_path / "wrong.py").write_text(TYPED + "\n".join(wrong) + "\n")
+    command = [sys.executable, "-m", "basedpyright", "--pythonpath", sys.executable, "--outputjson"]
+    ended = subprocess.run([*command, "-p", tmp_path], capture_output=True, text=True, cwd=tmp_path)
+    told = [one for one in json.loads(ended.stdout)["generalDiagnostics"] if one["severity"] == "error"]
+    assert [(Path(one["file"]).name, one["rule"]) for one in told] == [
+        ("wrong.py", "reportArgumentType") for _ in wrong
+    ], ended.stdout
+    first = len(TYPED.splitlines())
+    assert [one["range"]["start"]["line"] - first for one in told] == [0, 1, 2]
