@@ -121,3 +121,25 @@ def test_jobs_alternate():
     assert calls == 3 * ["a", "b"]
     assert seconds.shape == (3, 2)
     assert np.all(seconds >= 0)
+
+
+def test_the_page_of_accuracy_is_what_the_record_says():
+    import accuracy_mm
+
+    text = accuracy_mm.table(records.read(records.RECORDS / "covariance.csv"))
+    page = (records.DOCS / "accuracy.md").read_text(encoding="utf-8")
+    assert records.filled(page, {"accuracy": text}) == page
+    assert text in page
+
+
+def test_accuracy_is_summed_up_by_part():
+    import accuracy_mm
+
+    rows = [
+        {"where": "bin", "part": part, "shift_mm": shift, "turn_deg": turn}
+        for part, shift, turn in (("a", "0.5", "1"), ("a", "1.5", "1"), ("b", "0.5", "3"))
+    ]
+    lines = accuracy_mm.table(rows).splitlines()[2:]
+    assert lines[0] == "| in a bin | a | 2 | 1.00 | 1.45 | 1.00 | 1.00 | 0.50 |"
+    assert lines[1] == "| in a bin | b | 1 | 0.50 | 0.50 | 3.00 | 3.00 | 0.00 |"
+    assert lines[2].startswith("| in a bin | all | 3 | 0.50 |")
