@@ -1,4 +1,4 @@
-"""How far poses are off in millimetres and degrees, by part: prints a table of what covariance.py has recorded.
+"""How far poses are off in millimetres and degrees, by part: a table of what covariance.py has recorded.
 
 python benchmarks/accuracy_mm.py --docs
 """
