@@ -10,10 +10,12 @@ from pathlib import Path
 import ibi_rs as ibi
 import numpy as np
 import pytest
+import tiny_sets
 from test_batch import EXPECTED, JOBS, MODEL, SCENES, content, values
-from test_detector import MODEL as BOX_MODEL
+from test_cli import run
 from test_detector import batch
 from test_process import LIMIT_S
+from tiny_sets import BOX
 
 NO_CLUSTERS = "large, so not in the group of the tests: `make test-clusters` installs it and has these run"
 
@@ -34,11 +36,14 @@ def deadly(name):
     return Deadly(MODEL, SCENES[0].tgt, SCENES[0].corr, name=str(name))
 
 
+COARSE = ibi.Model.from_mesh(*BOX, voxel=5)  # 200 scans are many
+
+
 class DeadlyDetector(ibi.Detector):
     """Kills its worker over scan 50, until the file exists that it is named by."""
 
     def __init__(self, name):
-        super().__init__(BOX_MODEL, max_instances=1)
+        super().__init__(COARSE, max_instances=1)
         self.name = name
 
     def __call__(self, batch):
@@ -55,7 +60,7 @@ NUM_SCANS = 200
 def scans():
     """As many as there are of ten kinds, each with the pose that is found."""
     held = batch(range(10))
-    found = ibi.Detector(BOX_MODEL, max_instances=1)(held)["target_from_source"]
+    found = ibi.Detector(COARSE, max_instances=1)(held)["target_from_source"]
     assert len(found) == 10
     rows = [
         {"scan_id": i, "points": held["points"][i % 10].ravel(), "viewpoint": np.zeros(3)}
@@ -146,6 +151,28 @@ def test_a_dask_bag_loses_no_scan_with_a_worker(dask_client, scans, tmp_path):
     check(found, poses)
 
 
+def bop_on(cluster, root, path):
+    """Poses that `ibi bop` finds there."""
+    result = run("bop", root, "-o", path, "--cluster", cluster)
+    assert result.exit_code == 0, result.output
+    assert "recall     " in result.stdout
+    return [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """A set of BOP, and what is found without a cluster."""
+    folder = tmp_path_factory.mktemp("sets")
+    root = tiny_sets.bop(folder / "tiny")
+    assert run("bop", root, "-o", folder / "a.csv", "--jobs", 1).exit_code == 0
+    return root, [line.rsplit(",", 1)[0] for line in (folder / "a.csv").read_text().splitlines()]
+
+
+def test_a_set_of_bop_is_found_on_dask(dask_client, tiny, tmp_path):
+    root, wanted = tiny
+    assert bop_on(dask_client.scheduler.address, root, tmp_path / "a.csv") == wanted
+
+
 def test_a_dask_client_is_no_executor(dask_client):
     with pytest.raises(TypeError, match=r"of Dask client.get_executor\(\)"):
         ibi.register_batch(JOBS, dask_client)
@@ -159,7 +186,9 @@ def ray():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")  # it would leave a token in the home directory
         patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # its default warns of itself
-        patch.setenv("PYTHONPATH", os.path.dirname(__file__))  # of the workers, for `Deadly`
+        patch.setenv(
+            "PYTHONPATH", os.path.dirname(__file__), prepend=os.pathsep
+        )  # of the workers, for `Deadly`
         ray = pytest.importorskip("ray", reason=NO_CLUSTERS)
         ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, configure_logging=False)
         yield ray
@@ -190,6 +219,31 @@ def test_ray_drops_what_waits_when_a_batch_is_closed(ray):
     assert content(next(found)) == EXPECTED[0]
     found.close()
     assert executor.submit(int, "3").result(LIMIT_S) == 3
+
+
+@pytest.mark.filterwarnings("ignore:.*is deprecated:DeprecationWarning")  # its own settings
+def test_ray_data_loses_no_scan_with_a_worker(ray, scans, tmp_path):
+    data = pytest.importorskip("ray.data", reason="Ray Data needs pandas and pyarrow")
+    data.DataContext.get_current().enable_progress_bars = False
+    rows, poses = scans
+    found = (
+        data.from_items(rows, override_num_blocks=NUM_SCANS // 8)
+        .map_batches(
+            DeadlyDetector,
+            fn_constructor_args=(str(tmp_path / "was here"),),
+            batch_size=8,
+            compute=data.ActorPoolStrategy(size=2),
+            num_cpus=0.5,  # of two: the readers want one
+        )
+        .take_all()
+    )
+    assert (tmp_path / "was here").exists()
+    check(found, poses)
+
+
+def test_a_set_of_bop_is_found_on_ray(ray, tiny, tmp_path):
+    root, wanted = tiny
+    assert bop_on("ray", root, tmp_path / "a.csv") == wanted
 
 
 # Neither -------------------------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ const GRAIN: usize = 128;
 ///
 /// # Complexity
 /// At most O(n m d) time, a fraction of it where descriptors are as alike as those of one object are; about twice the
-/// memory of the sources (with `mutual`: of both).
+/// memory of the sources (with `mutual`: of both), and 16 bytes of each row a thread.
 pub fn match_features(
     source: Descriptors<'_>,
     target: Descriptors<'_>,

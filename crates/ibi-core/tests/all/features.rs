@@ -175,7 +175,7 @@ fn descriptors(dim: usize, most: usize) -> impl Strategy<Value = Vec<Vec<f32>>> 
 proptest! {
     #[test]
     fn matches_are_their_twin(
-        (dim, source, target) in (1..40_usize).prop_flat_map(|d| (Just(d), descriptors(d, 90), descriptors(d, 40))),
+        (dim, source, target) in (1..40_usize).prop_flat_map(|d| (Just(d), descriptors(d, 90), descriptors(d, 150))),
         k in 1..4_usize, mutual: bool, max_ratio in prop::option::of(0.3..=1.0),
     ) {
         let found = joined(&source, &target, dim, Matching { k, mutual, max_ratio });
