@@ -43,9 +43,6 @@ class Measures:
         Standard deviation of the scan across its surfaces, in voxels.
     blur : float
         The noise times the spacing of the measured points, both in voxels: that of all in a voxel together.
-    edges : float or None
-        How sharp the scan's edges are: near 1 where rays end on one surface or the other, small where the
-        camera has smoothed the step between them; None where hardly any edge is near.
     closeness, evidence : float
         As of a :class:`Pose`, among the points that no other pose owned then.
     """
@@ -62,7 +59,6 @@ class Measures:
     losses: tuple[float, float, float]
     noise: float
     blur: float
-    edges: float | None
     closeness: float
     evidence: float
 
@@ -82,7 +78,6 @@ class Measures:
             losses=tuple(raw["losses"]),
             noise=raw["noise"],
             blur=raw["blur"],
-            edges=raw["edges"],
             closeness=raw["closeness"],
             evidence=raw["evidence"],
         )

@@ -3,8 +3,8 @@
 use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
 
 use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
-use super::noise::{noise_of_rays, sharpness_of_edges, spacing_of_rays};
-use super::odds::{Measures, blurred};
+use super::noise::{noise_of_rays, spacing_of_rays};
+use super::odds::{BLURRED, Measures};
 use super::rays::{Rays, visible};
 use super::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
 use super::settle::{Steps, settle};
@@ -26,7 +26,6 @@ pub(crate) struct Closeup {
     voxel: f64,
     noise: f64,
     blur: f64,
-    edges: Option<f64>,
     tolerance: Tolerance,
 }
 
@@ -100,15 +99,14 @@ impl Closeup {
         // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
         let noise = noise_of_rays(&rays[0], &scene.target.points);
         let blur = noise / voxel * (spacing_of_rays(&rays[0], &scene.target.points, voxel) / voxel);
-        let edges = sharpness_of_edges(&rays[0], &scene.target.points, voxel);
-        if blurred(blur, edges) >= 1.0 && of_all.is_none() {
+        if blur >= BLURRED && of_all.is_none() {
             return None;
         }
         let tolerance = Tolerance::of(voxel, noise);
         let tolerance = Tolerance { aside: tolerance.aside.max(spacing), ..tolerance };
         let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
         let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);
-        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, blur, edges, tolerance })
+        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, blur, tolerance })
     }
 
     /// A pose settled, and what was measured of it.
@@ -160,7 +158,6 @@ impl Closeup {
                 losses: losses_of,
                 noise: noise / voxel,
                 blur: self.blur,
-                edges: self.edges,
                 is_fused: self.is_fused,
                 ..Measures::default()
             },

@@ -50,32 +50,6 @@ pub fn spacing_of_rays(rays: &Rays, points: &[Point3<f64>], radius: f64) -> f64 
     (std::f64::consts::PI / most).sqrt() * radius
 }
 
-/// An edge is a disc of rays, this wide and this deep, voxels; and so few rays or edges tell nothing.
-const EDGE_RADIUS: f64 = 1.5;
-const EDGE_DEPTH: f64 = 4.0;
-const FEW_RAYS: usize = 6;
-const FEW_EDGES: usize = 30;
-
-/// How sharp the edges are at which one surface ends before another: of all discs of rays 1.5 voxels about a point whose ends span 4
-/// voxels in depth, the mean share of that span that no ray ends in. Near 1 where rays end on one surface or the other, and small where
-/// what measured has smoothed the step (a window of stereo, light that spreads) and rays end all over it. `None` where hardly any edge is
-/// near the points.
-#[must_use]
-pub fn sharpness_of_edges(rays: &Rays, points: &[Point3<f64>], voxel: f64) -> Option<f64> {
-    let some = points.iter().step_by(points.len().div_ceil(SAMPLE).max(1));
-    let around = |point: &Point3<f64>| {
-        let angle = (EDGE_RADIUS * voxel / (point - rays.eye()).norm()).min(MAX_ANGLE);
-        let mut ranges = Vec::new();
-        rays.each_near(point, angle, |end, _| ranges.push(end.norm()));
-        ranges.sort_unstable_by(f64::total_cmp);
-        let span = ranges.last()? - ranges[0];
-        let is_edge = ranges.len() >= FEW_RAYS && span >= EDGE_DEPTH * voxel;
-        is_edge.then(|| ranges.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max) / span)
-    };
-    let edges: Vec<f64> = some.filter_map(around).collect();
-    (edges.len() >= FEW_EDGES).then(|| edges.iter().sum::<f64>() / edges.len() as f64)
-}
-
 /// The same as [`noise_of_rays`] of a scan that no single eye made: of the 12 nearest points, within the reach of `nearby`, which holds the points.
 #[must_use]
 pub fn noise_of_cloud(points: &[Point3<f64>], nearby: &Nearby) -> f64 {

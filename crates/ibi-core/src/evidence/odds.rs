@@ -20,8 +20,6 @@ pub struct Measures {
     pub noise: f64,
     /// That of as many points as there are in a voxel, together: the noise times their spacing, both in voxels.
     pub blur: f64,
-    /// How sharp the scan's edges are, see [`super::noise::sharpness_of_edges`].
-    pub edges: Option<f64>,
     /// Whether the scan was fused from what several cameras measured, or one that went about.
     pub is_fused: bool,
     /// How close its points lie on the thinned clouds, see [`super::Support::closeness`].
@@ -57,20 +55,11 @@ const SHARP: [f64; TERMS] = [-2.77, -26.9, -4.31, -35.9, 2.01, 0.0, 0.66, 2.24, 
 /// several sides, so that a right pose is held by all of its faces, and has more ends that are seen past than a wrong one.
 const FUSED: [f64; TERMS] = [-14.7, -9.6, -4.6, -45.3, 4.1, 2.0, 0.0, 3.3, 1.46, 0.47];
 
-/// Up to the first a scan is sharp, and from the second on a close look may tell no more than the clouds; in between that counts in
+/// Up to the first a scan is sharp, and from the second on a close look tells no more than the clouds; in between it counts in
 /// proportion. Bins of the tuning half have 0.116 at most. Coarse real scans of parts that are not quite the model's shape have 0.158 and
-/// more: there a close look mistrusts every pose.
-const BLUR: [f64; 2] = [0.12, 0.15];
-
-/// But not where edges are sharp: from the first on they are soft, up to the second in proportion. Those real scans of the tuning half
-/// have 0.22 and 0.37, ray-cast ones as coarse, in which a close look is as sure as in fine ones, 0.49 to 0.78.
-const EDGES: [f64; 2] = [0.38, 0.46];
-
-/// How much a scan is blurred, from 0 to 1: coarse and noisy, and smoothed.
-pub(super) fn blurred(blur: f64, edges: Option<f64>) -> f64 {
-    let share = |value: f64, [from, to]: [f64; 2]| ((value - from) / (to - from)).clamp(0.0, 1.0);
-    share(blur, BLUR) * edges.map_or(0.0, |edges| 1.0 - share(edges, EDGES))
-}
+/// more: there a close look mistrusts every pose. (In ray-cast scans as coarse it is as sure as in sharp ones.)
+const BLUR: [f64; 2] = [0.12, BLURRED];
+pub(super) const BLURRED: f64 = 0.15;
 
 /// Of a loss the root: the step from none to a little tells most.
 fn held(loss: f64) -> f64 {
@@ -122,12 +111,13 @@ impl Measures {
             f64::from(self.contour.ends).ln_1p(),
             self.evidence.ln_1p(),
         ];
-        let of_clouds = [1.0, self.evidence.ln_1p(), self.closeness];
+        let blurred = [1.0, self.evidence.ln_1p(), self.closeness];
         // Of a fused scan the clouds alone tell nothing.
-        let blur = if self.is_fused { 0.0 } else { blurred(self.blur, self.edges) };
+        let blur = if self.is_fused { 0.0 } else { self.blur };
+        let blur = ((blur - BLUR[0]) / (BLUR[1] - BLUR[0])).clamp(0.0, 1.0);
         let weighed =
             |terms: &[f64], weights: &[f64]| -> f64 { terms.iter().zip(weights).map(|(a, b)| a * b).sum() };
-        (1.0 - blur) * weighed(&sharp, self.weights()) + blur * weighed(&of_clouds, &ONE_SIDED)
+        (1.0 - blur) * weighed(&sharp, self.weights()) + blur * weighed(&blurred, &ONE_SIDED)
     }
 
     /// The probability that the pose is right.

@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use ibi_core::evidence::contour::{Contour, Overrun, Placed, Rim, Scan, contour, overrun, run_on};
 use ibi_core::evidence::explained::{Reach, Shape, explained};
-use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays, sharpness_of_edges, spacing_of_rays};
+use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays, spacing_of_rays};
 use ibi_core::evidence::odds::Measures;
 use ibi_core::evidence::rays::{MAX_ANGLE, MIN_FACING_COS, Rays, visible};
 use ibi_core::evidence::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
@@ -699,7 +699,6 @@ fn what_speaks_for_a_pose_raises_its_odds() {
         losses: [0.1, 0.2, 0.3],
         noise: 0.05,
         blur: 0.02,
-        edges: None,
         is_fused: false,
         closeness: 0.9,
         evidence: 3.0,
@@ -771,24 +770,6 @@ fn points_are_as_far_apart_as_pixels_that_measured_something() {
     is(spacing(|at| at % 2 == 0), 0.024 * 2_f64.sqrt());
     let rays = Rays::new(Point3::origin(), &image(0.008, 0.25, |_, _| Some(3.0))).unwrap();
     assert_eq!(spacing_of_rays(&rays, &[], 0.2), f64::INFINITY);
-}
-
-/// A wall, and a step of 8 voxels before its right half that is as wide as `ramp` pixels.
-#[test]
-fn edges_are_as_sharp_as_a_step_is_narrow() {
-    let (pixel, voxel) = (0.008, 0.05);
-    let sharpness = |ramp: f64| {
-        let depth = |x: f64| 3.0 - 0.4 * ((x / pixel + 0.5) / ramp + 0.5).clamp(0.0, 1.0);
-        let scan = image(pixel, 0.25, |x, _| Some(depth(x)));
-        sharpness_of_edges(&Rays::new(Point3::origin(), &scan).unwrap(), &scan, voxel)
-    };
-    let [narrow, wide] = [1e-3, 6.0].map(|ramp| sharpness(ramp).unwrap());
-    assert!(narrow > 0.9 && wide < 0.35, "{narrow}, {wide}");
-    // A flat wall has none, and neither has nothing.
-    let wall = image(pixel, 0.25, |_, _| Some(3.0));
-    let rays = Rays::new(Point3::origin(), &wall).unwrap();
-    assert_eq!(sharpness_of_edges(&rays, &wall, voxel), None);
-    assert_eq!(sharpness_of_edges(&rays, &[], voxel), None);
 }
 
 fn is_tie_at_12(cloud: &[Point3<f64>], point: &Point3<f64>) -> bool {
