@@ -221,26 +221,6 @@ def test_ray_drops_what_waits_when_a_batch_is_closed(ray):
     assert executor.submit(int, "3").result(LIMIT_S) == 3
 
 
-@pytest.mark.filterwarnings("ignore:.*is deprecated:DeprecationWarning")  # its own settings
-def test_ray_data_loses_no_scan_with_a_worker(ray, scans, tmp_path):
-    data = pytest.importorskip("ray.data", reason="Ray Data needs pandas and pyarrow")
-    data.DataContext.get_current().enable_progress_bars = False
-    rows, poses = scans
-    found = (
-        data.from_items(rows, override_num_blocks=NUM_SCANS // 8)
-        .map_batches(
-            DeadlyDetector,
-            fn_constructor_args=(str(tmp_path / "was here"),),
-            batch_size=8,
-            compute=data.ActorPoolStrategy(size=2),
-            num_cpus=0.5,  # of two: the readers want one
-        )
-        .take_all()
-    )
-    assert (tmp_path / "was here").exists()
-    check(found, poses)
-
-
 def test_a_set_of_bop_is_found_on_ray(ray, tiny, tmp_path):
     root, wanted = tiny
     assert bop_on("ray", root, tmp_path / "a.csv") == wanted
