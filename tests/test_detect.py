@@ -31,8 +31,8 @@ def tee():
 
 @pytest.mark.parametrize(("name", "hits", "most"), [("tee6", 6, 6), ("two", 1, 2), ("multi", 4, 6)])
 def test_the_labelled_parts_are_found(name, hits, most):
-    # In `multi` parts without a label can be seen. In `two` the second part is found 0.1008 diameters off:
-    # 0.1 makes a hit.
+    # In `multi` parts without a label can be seen. In `two` the second pose is wrong: half a turn about the
+    # normal of the face that it lies on, and 30 mm off.
     mesh, scan, labels = example(name)
     model = ibi.Model.from_mesh(*mesh)
     found = model.detect(scan, viewpoint=CAMERA)

@@ -115,10 +115,7 @@ def instances(
         about.append(f"camera at {x:.6g}, {y:.6g}, {z:.6g}")
     _head(figure, title, about)
     _label(figure, views, [str(k) for k in range(len(poses))])
-    if path is not None:
-        with written(path) as part:
-            figure.savefig(part, dpi=_DPI, format=picture_format)
-    return figure
+    return _saved(figure, path, picture_format)
 
 
 def outlines(
@@ -210,10 +207,7 @@ def outlines(
     depth = f"depth {ends} {unit or ''}".strip()
     _head(figure, title, [f"as the camera sees it, near is light: {depth}", "number and score of each part"])
     _label(figure, [(axes, centres)], texts)
-    if path is not None:
-        with written(path) as part:
-            figure.savefig(part, dpi=_DPI, format=picture_format)
-    return figure
+    return _saved(figure, path, picture_format)
 
 
 _DPI = 110
@@ -234,6 +228,13 @@ def _figure(width: float, height: float) -> Any:
 
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _saved(figure: Any, path: str | os.PathLike[str] | None, picture_format: str | None) -> Any:
+    if path is not None:
+        with written(path) as part:
+            figure.savefig(part, dpi=_DPI, format=picture_format)
     return figure
 
 
