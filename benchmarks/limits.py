@@ -2,6 +2,7 @@
 
     python benchmarks/limits.py                        # or: make bench-limits
     python benchmarks/limits.py --only joint --repeats 1
+    python benchmarks/limits.py --only thinning --sizes 4000000 8000000 16000000
     python benchmarks/limits.py --docs                 # writes benchmarks/records/limits.csv
 
 Of each case the time at each size is the least of the repeats, and the exponent the slope of a line through
@@ -9,6 +10,10 @@ their logarithms; times below 10 ms say nothing about growth and are left out of
 run again with an end: by `timeout_s`, where there is one, and by a signal whose handler raises, as Ctrl-C's
 does. Both come after several shares of the time that the whole takes, 0.5 s at most. `late` is how much later
 the call was back, at worst.
+
+Half a million points are in the processor's caches and five million are not, so each costs two to three times
+as much: the exponents of `many points`, `a ball as model` and `thinning` hold that step. `--sizes` beyond it
+tells the growth of the work itself.
 
 A case is one line in `CASES` or, outside of the rounds, in limits_geometry_cases.py; a new one needs a
 function that makes a call of a size. On a busy machine `--cpu` counts the seconds of the processor, of all
@@ -20,7 +25,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -267,6 +272,7 @@ def main() -> None:
         __doc__,
         cli.option("--only", default="", help="cases whose name holds this"),
         cli.repeats(3),
+        cli.option("--sizes", type=int, nargs="+", help="sizes in the place of those of the cases"),
         cli.option("--longest", type=float, default=60.0, help="seconds after which no larger size is tried"),
         cli.flag("--docs", "write the record"),
         cli.option("--out", type=Path, help="folder for the record; by default benchmarks/records"),
@@ -280,6 +286,7 @@ def main() -> None:
     for case in [*CASES, *(Case(*row) for row in ROWS)]:
         if args.only not in case.name:
             continue
+        case = replace(case, sizes=tuple(args.sizes or case.sizes))
         for row in run(case, args.repeats, args.longest, clock):
             cells = [row.get(name, "") for name in fields]
             show("{:28s}  {:>8}  {:>8}  {:>8}  {:>14}  {:>10}".format(*cells))

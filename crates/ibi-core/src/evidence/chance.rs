@@ -10,7 +10,7 @@ use crate::scene::{PointPairs, Scene, Tolerances};
 /// instance was found.
 #[derive(Debug, Default)]
 pub(crate) struct Chance {
-    /// For each source point the share of all correspondences that would agree with it.
+    /// For each source point of a correspondence the share of all that would agree with it.
     pub(super) agreement: Vec<f32>,
     /// The fit of a pose somewhere on the target.
     pub(super) fit: f64,
@@ -30,9 +30,9 @@ impl Chance {
     }
 }
 
-/// For each source point the share of the correspondences whose source point lies within `t_he` of it (and
+/// For each source point of a correspondence the share of those whose source point lies within `t_he` of it (and
 /// agrees in its normal, where normals count): how likely a correspondence that knows nothing of its target
-/// point would agree there.
+/// point would agree there. 0 for the other points, which nobody asks about.
 fn agreement(scene: &Scene<'_>, pairs: &PointPairs, interrupt: &Interrupt) -> Vec<f32> {
     /// Points of like normals that are looked at around one, at most.
     const MOST_NEAR: usize = 1 << 12;
@@ -46,7 +46,7 @@ fn agreement(scene: &Scene<'_>, pairs: &PointPairs, interrupt: &Interrupt) -> Ve
     }
     let near = if let Some((n, min_cos)) = source.normals.as_deref().zip(min_normal_cos) {
         par::map(source.points.len(), 512, |row| {
-            if row % 64 == 0 && interrupt.is_set() {
+            if (row % 64 == 0 && interrupt.is_set()) || uses[row] == 0 {
                 return 0;
             }
             let alike =

@@ -63,13 +63,21 @@ impl Grid {
 
     /// The same where the [`bulk`] of each axis is known.
     pub(crate) fn in_box(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
-        let grid = Self::dense(points, bounds, cell);
+        Self::in_box_until(points, bounds, cell, &|| false)
+            .unwrap_or_else(|| unreachable!("nobody interrupts"))
+    }
+
+    /// The same; `None` once `interrupted` says so.
+    pub(crate) fn in_box_until(
+        points: &[Vec<f32>; 3],
+        bounds: [(f32, f32); 3],
+        cell: f32,
+        interrupted: &dyn Fn() -> bool,
+    ) -> Option<Self> {
+        let grid = Self::dense(points, bounds, cell, interrupted)?;
         let widened = cell * grid.inv_cell.iter().fold(f32::INFINITY, |least, &inv| least.min(inv));
-        if widened * MOST_WIDENED < 1.0 && grid.sharing(points) > MOST_SHARED {
-            Self::sparse(points, bounds, cell)
-        } else {
-            grid
-        }
+        let is_sparse = widened * MOST_WIDENED < 1.0 && grid.sharing(points) > MOST_SHARED;
+        Some(if is_sparse { Self::sparse(points, bounds, cell) } else { grid })
     }
 
     /// With how many others a point shares its cell, on average over some of `points`, those of the grid.
@@ -99,7 +107,12 @@ impl Grid {
     }
 
     /// A grid that knows where each cell begins.
-    fn dense(points: &[Vec<f32>; 3], bounds: [(f32, f32); 3], cell: f32) -> Self {
+    fn dense(
+        points: &[Vec<f32>; 3],
+        bounds: [(f32, f32); 3],
+        cell: f32,
+        interrupted: &dyn Fn() -> bool,
+    ) -> Option<Self> {
         let n = points[0].len();
         let max_cells = (CELLS_PER_POINT * n).max(MIN_CELLS);
         let widest = bounds.iter().map(|(low, high)| high - low).fold(0.0, f32::max);
@@ -134,8 +147,8 @@ impl Grid {
             },
         );
         let pairs = (0_u32..).zip(cells.iter().map(|&cell| cell as usize));
-        (grid.starts, grid.order) = buckets(grid.shape.iter().product(), pairs);
-        grid
+        (grid.starts, grid.order) = buckets_until(grid.shape.iter().product(), pairs, interrupted)?;
+        Some(grid)
     }
 
     /// A grid that knows of no cell but those that hold points. They are as wide as can be wished, or nearly so.
@@ -390,20 +403,49 @@ pub(crate) fn buckets(
     count: usize,
     pairs: impl Iterator<Item = (u32, usize)> + Clone,
 ) -> (Vec<u32>, Vec<u32>) {
+    buckets_until(count, pairs, &|| false).unwrap_or_else(|| unreachable!("nobody interrupts"))
+}
+
+/// The same; `None` once `interrupted` says so.
+fn buckets_until(
+    count: usize,
+    pairs: impl Iterator<Item = (u32, usize)> + Clone,
+    interrupted: &dyn Fn() -> bool,
+) -> Option<(Vec<u32>, Vec<u32>)> {
     // Two places on, so that what counts where the next item of a bucket goes ends as the start of the bucket after it.
     let mut starts = vec![0_u32; count + 2];
-    pairs.clone().for_each(|(_, bucket)| starts[bucket + 2] += 1);
+    for_each_until(pairs.clone(), interrupted, |(_, bucket)| starts[bucket + 2] += 1)?;
     let mut sum = 0;
     for start in &mut starts {
         sum += *start;
         *start = sum;
     }
     let mut items = vec![0; sum as usize];
-    for (item, bucket) in pairs {
+    for_each_until(pairs, interrupted, |(item, bucket)| {
         let next = &mut starts[bucket + 1];
         items[*next as usize] = item;
         *next += 1;
-    }
+    })?;
     starts.pop();
-    (starts, items)
+    Some((starts, items))
+}
+
+/// Calls `look` on each of `items`, and asks now and then whether to go on; `None` if not.
+fn for_each_until<T>(
+    mut items: impl Iterator<Item = T>,
+    interrupted: &dyn Fn() -> bool,
+    mut look: impl FnMut(T),
+) -> Option<()> {
+    const RUN: usize = 1 << 18;
+    let mut num = RUN;
+    while num == RUN {
+        if interrupted() {
+            return None;
+        }
+        num = items.by_ref().take(RUN).fold(0, |num, item| {
+            look(item);
+            num + 1
+        });
+    }
+    Some(())
 }

@@ -62,10 +62,7 @@ impl Nearby {
     /// The same where most questions are within `usual`, which is no more than the reach.
     #[must_use]
     pub fn with_usual(points: &[Point3<f64>], reach: f64, usual: f64) -> Self {
-        let rows = columns(points, middle(points), reach);
-        let (grid, bounds) = Self::sort(&rows, reach, usual);
-        let sorted = Sorted::new(&rows, grid);
-        Self::of(points, [reach, usual], sorted, &rows, bounds, &|| false)
+        Self::until(points, reach, usual, || false).unwrap_or_else(|| unreachable!("nobody interrupts"))
     }
 
     /// The same; `None` once `interrupted` says so.
@@ -78,60 +75,35 @@ impl Nearby {
         if interrupted() {
             return None;
         }
-        let rows = columns(points, middle(points), reach);
-        if interrupted() {
-            return None;
-        }
-        let (grid, bounds) = Self::sort(&rows, reach, usual);
-        if interrupted() {
-            return None;
-        }
-        let sorted = Sorted::new(&rows, grid);
-        let nearby = Self::of(points, [reach, usual], sorted, &rows, bounds, &interrupted);
-        (!interrupted()).then_some(nearby)
-    }
-
-    /// The grid over the columns of some points, and the box around their bulk.
-    fn sort(rows: &[Vec<f32>; 3], reach: f64, usual: f64) -> (Grid, [(f32, f32); 3]) {
-        let bounds = rows.each_ref().map(|axis| bulk(axis));
-        // The reach is 1. A cell and its neighbours hold what is usual, and the blocks of two cells an axis half of it for
-        // sure.
-        (Grid::in_box(rows, bounds, cell_of(reach, usual)), bounds)
-    }
-
-    fn of(
-        points: &[Point3<f64>],
-        [reach, usual]: [f64; 2],
-        sorted: Sorted,
-        rows: &[Vec<f32>; 3],
-        bounds: [(f32, f32); 3],
-        interrupted: &dyn Fn() -> bool,
-    ) -> Self {
-        let sharing = sorted.grid.sharing(rows);
-        let mut nearby =
-            Self { sorted, all: None, sharing, middle: middle(points), reach, inv_reach: 1.0 / reach };
-        let mut sharing = nearby.sharing;
+        let middle = middle(points);
+        let rows = columns(points, middle, reach);
+        let bounds = bounds(&rows);
+        let grid = Grid::in_box_until(&rows, bounds, cell_of(reach, usual), &interrupted)?;
+        let mut sharing = grid.sharing(&rows);
+        let sorted = Sorted::until(&rows, grid, &interrupted)?;
+        let mut nearby = Self { sorted, all: None, sharing, middle, reach, inv_reach: 1.0 / reach };
         if sharing > MOST_SHARED {
-            let (distinct, kept) = distinct(rows);
+            let (distinct, kept) = distinct(&rows);
             let widest = bounds.iter().map(|(low, high)| high - low).fold(f32::MIN_POSITIVE, f32::max);
             let mut cell = cell_of(reach, usual).min(widest);
             let mut grid = None;
-            while sharing > SHARED && cell > LEAST_PART * widest && !interrupted() {
+            while sharing > SHARED && cell > LEAST_PART * widest {
                 // They may fill a volume or a surface, or lie in clusters: not too narrow at once.
                 cell *= (SHARED as f32 / sharing as f32).cbrt().clamp(0.25, 0.8);
-                let finer = Grid::in_box(&distinct, bounds, cell);
+                let finer = Grid::in_box_until(&distinct, bounds, cell, &interrupted)?;
                 sharing = finer.sharing(&distinct);
                 grid = Some(finer);
             }
             if let Some(grid) = grid {
-                let all = std::mem::replace(&mut nearby.sorted, Sorted::of(&distinct, grid, &kept));
+                let finer = Sorted::of(&distinct, grid, &kept, &interrupted)?;
+                let all = std::mem::replace(&mut nearby.sorted, finer);
                 nearby.all = (kept.len() < points.len()).then_some(all);
                 if nearby.all.is_none() {
                     nearby.sharing = sharing;
                 }
             }
         }
-        nearby
+        (!interrupted()).then_some(nearby)
     }
 
     /// With the points that coincide.
@@ -347,7 +319,13 @@ impl Nearby {
     }
 }
 
-/// How wide cells are, in reaches.
+/// The box around the bulk of some points.
+fn bounds(rows: &[Vec<f32>; 3]) -> [(f32, f32); 3] {
+    rows.each_ref().map(|axis| bulk(axis))
+}
+
+/// How wide cells are, in reaches: a cell and its neighbours hold what is usual, and the blocks of two cells an axis half
+/// of it for sure.
 fn cell_of(reach: f64, usual: f64) -> f32 {
     1.005 * (usual / reach) as f32
 }
@@ -573,13 +551,12 @@ fn nearest_distances(points: &[Point3<f64>], interrupted: impl Fn() -> bool) -> 
     let rows = columns(points, middle, unit);
     // About as many cells as points fill a volume. Most clouds are surfaces: then cells are crowded, and a few
     // questions tell how much finer they should be.
-    let bounds = rows.each_ref().map(|axis| bulk(axis));
+    let bounds = bounds(&rows);
     let widest = bounds.iter().fold(0.0, |widest: f32, (low, high)| widest.max(high - low));
     let size = unit * Vector3::from(bounds.map(|(low, high)| f64::from(high - low))).norm();
     let sorted = |cell| {
-        let grid = Grid::in_box(&rows, bounds, cell);
-        let sorted = (!interrupted()).then(|| Sorted::new(&rows, grid));
-        sorted.filter(|_| !interrupted())
+        let grid = Grid::in_box_until(&rows, bounds, cell, &interrupted)?;
+        Sorted::until(&rows, grid, &interrupted).filter(|_| !interrupted())
     };
     let coarse = sorted(widest / (n as f32 / POINTS_PER_CELL).cbrt())?;
     let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE));
@@ -621,25 +598,32 @@ struct Sorted {
 }
 
 impl Sorted {
-    fn new(rows: &[Vec<f32>; 3], grid: Grid) -> Self {
-        let sorted = Self::columns_of(rows, &grid);
+    /// `None` once `interrupted` says so.
+    fn until(rows: &[Vec<f32>; 3], grid: Grid, interrupted: &dyn Fn() -> bool) -> Option<Self> {
+        let points = Self::columns_of(rows, &grid, interrupted)?;
         let rows = grid.order().iter().copied().chain([NONE; LANES]).collect();
-        Self { grid, points: sorted, rows }
+        Some(Self { grid, points, rows })
     }
 
     /// The same of columns whose rows are `ids`, ascending.
-    fn of(rows: &[Vec<f32>; 3], grid: Grid, ids: &[u32]) -> Self {
-        let sorted = Self::columns_of(rows, &grid);
+    fn of(rows: &[Vec<f32>; 3], grid: Grid, ids: &[u32], interrupted: &dyn Fn() -> bool) -> Option<Self> {
+        let points = Self::columns_of(rows, &grid, interrupted)?;
         let rows = grid.order().iter().map(|&row| ids[row as usize]).chain([NONE; LANES]).collect();
-        Self { grid, points: sorted, rows }
+        Some(Self { grid, points, rows })
     }
 
-    fn columns_of(rows: &[Vec<f32>; 3], grid: &Grid) -> [Vec<f32>; 3] {
+    fn columns_of(
+        rows: &[Vec<f32>; 3],
+        grid: &Grid,
+        interrupted: &dyn Fn() -> bool,
+    ) -> Option<[Vec<f32>; 3]> {
         let order = grid.order();
-        rows.each_ref().map(|axis| {
+        let axis = |axis: &[f32]| {
             let at = |i: usize| order.get(i).map_or(f32::INFINITY, |&row| axis[row as usize]);
-            par::map(order.len() + LANES, GATHER_GRAIN, at)
-        })
+            (!interrupted()).then(|| par::map(order.len() + LANES, GATHER_GRAIN, at))
+        };
+        let [x, y, z] = rows;
+        Some([axis(x)?, axis(y)?, axis(z)?])
     }
 
     #[inline]
