@@ -101,13 +101,38 @@ def near(points: np.ndarray) -> object:
     return metrics.add_s(points, moved, np.eye(4))
 
 
+def of_zeros(job: Callable[[np.ndarray], object]) -> Callable[[int], Call]:
+    """Return a call on points of which three of four lie at the origin, as pixels of nothing do."""
+
+    def call_of(size: int) -> Call:
+        points = ball(size)
+        points[size // 4 :] = 0
+        return lambda _: job(points)
+
+    return call_of
+
+
+def wide(size: int) -> Call:
+    """Register where all of a model lies within `t_he` of each of its points, and normals count."""
+    rng = np.random.default_rng(4)
+    points, normals = rng.random((size, 3)), rng.normal(size=(size, 3))
+    corr = rng.integers(0, size, (size, 2))
+    corr[::2, 1] = corr[::2, 0]
+    options: dict[str, Any] = {"src_normals": normals, "tgt_normals": normals}
+    params = ibi.Params(t_he_pr=100, max_rounds=3)
+    return lambda timeout_s: ibi.register(points, points, corr, params, timeout_s=timeout_s, **options)
+
+
 THOUSANDS = (25_000, 50_000, 100_000, 200_000)
 MILLIONS = (500_000, 1_000_000, 2_000_000, 5_000_000)
 ROWS: list[tuple[str, Callable[[int], Call], tuple[int, ...], bool]] = [
     ("diameter of a ball", of_ball(metrics.diameter), (*THOUSANDS, 1_000_000), False),
     ("a ball as model", of_ball(ibi.Model), MILLIONS, False),
+    ("mostly zeros as model", of_zeros(ibi.Model), MILLIONS, False),
+    ("t_he over all, with normals", wide, THOUSANDS, True),
     ("own shadows", shadows, (40_000, 160_000, 500_000, 1_000_000), True),
     ("add_s", of_ball(near), MILLIONS[:3], False),
+    ("add_s, mostly zeros", of_zeros(near), MILLIONS[:3], False),
     ("score_scene by ADD-S", scored, (2500, 5000, 10_000, 20_000), False),
     ("thinning", of_ball(lambda p: features.voxel_downsample(p, 0.001, normals=p)), MILLIONS, False),
     ("normals", of_ball(lambda p: features.estimate_normals(p, 3 * len(p) ** -0.5)), MILLIONS[:3], False),

@@ -283,6 +283,7 @@ LINES = (
         Line(f"rows, gap {gap} mm: precision / recall", "rows", precision_recall, "", f"gap {gap} mm")
         for gap in GAPS
     ),
+    Line("piles, 11 shapes: precision / recall", "piles", precision_recall, ""),
     Line("rooms, little covered, eyes: recall", "rooms, eyes", recall_invented, ">= 0.80; none", "little"),
     Line("rooms, well covered, eyes: recall", "rooms, eyes", recall_invented, ">= 0.95; none", "well"),
     Line(

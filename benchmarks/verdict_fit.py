@@ -1,11 +1,12 @@
-"""Fit the weights of a close look, `SHARP` and `FUSED` of odds.rs, to the tuning half of verdict.py.
+"""Fit the weights of a close look, `SHARP`, `COARSE`, `FUSED` of odds.rs, to the tuning half of verdict.py.
 
 IBI_DATA=... python benchmarks/verdict_fit.py
 
 Each search gives the poses on which it was decided: those returned and those rejected. Right are those that
 are one to one with a truth. Others near the same truth are left out, and so are poses that are nearly right,
-and models of nearly the right size: neither answer would be wrong. Where a scan of one camera is
-blurred other weights hold, which are not fitted here; scans that were fused from many views have their own.
+and models of nearly the right size: neither answer would be wrong. A scan of one camera is sharp or coarse;
+where it is blurred other weights hold, which are not fitted here. What other poses add to a coarse one
+(`COMPANY`) is not among the terms.
 """
 
 from collections.abc import Iterator
@@ -30,12 +31,14 @@ TERMS = (
     "ends",
     "evidence",
 )
-SHARP = 0.1
-"""As in odds.rs: the blur up to which a scan is sharp."""
+SHARP, COARSE, SHARP_EDGES = 0.1, 0.13, 0.44
+"""As in odds.rs: up to which blur a scan is sharp and from which it is coarse, and from which sharpness on
+its edges are sharp."""
 NEARLY = 0.7 * RIGHT_BELOW, 1.4 * RIGHT_BELOW
-REGIMES = ("boxes", "scans", "bins", "rows", "rooms", "mirror", "sizes", "absent")
-POWER = {"SHARP": 0.5, "FUSED": 0.2}
-"""A class of n poses in a regime weighs n to 1 minus this. In rooms nothing may be invented."""
+REGIMES = ("boxes", "scans", "bins", "rows", "piles", "rooms", "mirror", "sizes", "absent")
+POWER = {"SHARP": 0.5, "COARSE": 0.2, "FUSED": 0.2}
+"""A class of n poses in a regime weighs n to 1 minus this. In rooms nothing may be invented, and in coarse
+scans company brings back what is lost."""
 SIGNS = [(None, None), *[(None, 0)] * 3, *[(0, None)] * 6]
 """What speaks against a pose may not speak for it."""
 
@@ -59,13 +62,17 @@ def terms(of: ibi.Measures) -> list[float]:
     ]
 
 
-def is_fused(search: Search) -> bool:
-    """Return whether a scan was fused from many views: those come with normals."""
-    return "tgt_normals" in search.scan.told
+def kind(search: Search, of: ibi.Measures) -> str | None:
+    """Return which weights hold for a scan, if one set does; what was fused from many views has normals."""
+    if "tgt_normals" in search.scan.told:
+        return "FUSED"
+    if of.blur < SHARP:
+        return "SHARP"
+    return "COARSE" if of.blur > COARSE and (of.edges or 0) > SHARP_EDGES else None
 
 
-def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]]:
-    """Search, and return the terms of each pose with whether it is right."""
+def decided(search: Search, models: Models) -> Iterator[tuple[str, list[float], bool]]:
+    """Search, and return the weights that hold for each pose, its terms, and whether it is right."""
     model, symmetries = models.of(search)
     found = model.detect(search.scan.points, **search.scan.told)
     all_ = [*found, *found.rejected]
@@ -75,22 +82,22 @@ def decided(search: Search, models: Models) -> Iterator[tuple[list[float], bool]
         is_right = state in (RIGHT, HIDDEN)
         is_other = distance < RIGHT_BELOW and not is_right
         is_nearly = search.scale == 1 and NEARLY[0] < distance < NEARLY[1]
-        is_weighed = pose.measures is not None and (is_fused(search) or pose.measures.blur < SHARP)
-        if is_weighed and not is_other and not is_nearly:
-            yield terms(pose.measures), is_right
+        weights = kind(search, pose.measures) if pose.measures else None
+        if weights and not is_other and not is_nearly:
+            yield weights, terms(pose.measures), is_right
 
 
 def main() -> None:
     """Collect, fit, print."""
     args = cli.parse(__doc__, cli.flag("--quick", "one or two scenes of each kind"))
     models = Models()
-    rows: dict[str, list[tuple[str, list[float], bool]]] = {"SHARP": [], "FUSED": []}
+    rows: dict[str, list[tuple[str, list[float], bool]]] = {weights: [] for weights in POWER}
     for regime in REGIMES:
         for search in ROWS[regime]("tuning", args.quick):
             is_nearly_size = search.scale != 1 and 0.85 < search.scale < 1.15
             if search.scan.half == "tuning" and not is_nearly_size:
-                weights = "FUSED" if is_fused(search) else "SHARP"
-                rows[weights] += [(regime, *pose) for pose in decided(search, models)]
+                for weights, *pose in decided(search, models):
+                    rows[weights].append((regime, *pose))
     for weights, poses in rows.items():
         show(f"\n{weights}, {len(poses)} poses")
         fit(poses, POWER[weights])

@@ -296,6 +296,18 @@ def rooms(half: Half, quick: bool) -> Iterator[Search]:
                 )
 
 
+def piles(half: Half, quick: bool) -> Iterator[Search]:
+    """Look for the part of which a pile is made: shapes of all kinds, two piles of each."""
+    names = [name for name in shapes("plain", half) if (MODELS / name).exists()]
+    for at in range(FIRST_SEED[half] + 400, FIRST_SEED[half] + 400 + fewer(quick, 2)):
+        for name in names[: fewer(quick, len(names), 2)]:
+            case = scans.pile(MODELS / name, at)
+            scan = Scan(
+                f"pile-{case.name}-{at}", case.points, {"viewpoint": [0, 0, 0]}, np.zeros((1, 3)), half
+            )
+            yield Search("piles", "piles", scan, case.name, case.mesh, case.poses, case.visibility)
+
+
 def absent(half: Half, quick: bool) -> Iterator[Search]:
     """Look for parts that are not there, in piles, bins and rooms: 40 times each, and for near-copies."""
     seed = count(FIRST_SEED[half] + 100)
@@ -377,6 +389,7 @@ ROWS: dict[str, Callable[[Half, bool], Iterator[Search]]] = {
     "scans": real_scans,
     "bins": bins,
     "rows": rows,
+    "piles": piles,
     "rooms": rooms,
     "absent": absent,
     "mirror": mirror,

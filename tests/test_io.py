@@ -342,6 +342,20 @@ def test_a_line_too_few_is_one(name, tmp_path):
         io.read_cloud(tmp_path / name)
 
 
+def test_a_face_that_is_cut_is_one_too_few(tmp_path):
+    text = exported("off").decode().rstrip().rsplit(maxsplit=1)[0]
+    (tmp_path / "a.off").write_text(text + "\n")
+    with pytest.raises(InputError, match=r"a\.off: the header says 320 whole faces, and 319 are there"):
+        io.read_mesh(tmp_path / "a.off")
+
+
+def test_what_trimesh_logs_is_not_printed(tmp_path, capfd):
+    text = exported("stl_ascii").decode().replace("facet normal ", "facet normal x", 1)
+    (tmp_path / "a.stl").write_text(text)
+    io.read_mesh(tmp_path / "a.stl")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_triangles_without_a_place_are_told_of(tmp_path):
     data = bytearray(exported("stl"))
     data[84 + 12 : 84 + 16] = np.float32(np.nan).tobytes()

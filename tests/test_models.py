@@ -411,6 +411,21 @@ def test_the_command_looks_into_a_box(files, scene):
     assert len(held["search"]["crop"]) == 6
 
 
+def test_the_command_leaves_out_what_is_always_there(files, scene):
+    scan = np.load(files / "scan.npy")
+    middle = np.mean(move(scene[1]["bolt"][1], BOLT[0]), axis=0)
+    np.save(files / "empty.npy", scan[np.abs(scan - middle).max(axis=1) > 40])
+    output = files / "one.json"
+    found = ("register", files / "bolt.obj", files / "scan.npy", "--background", files / "empty.npy")
+    result = run(*found, "-o", output)
+    assert result.exit_code == 0, result.output
+    held = json.loads(output.read_text())
+    assert len(held["poses"]) == 1
+    assert len(held["search"]["background_sha256"]) == 64
+    result = run(*found[:-1], files / "none.npy")
+    assert (result.exit_code, "none.npy" in result.stderr) == (1, True), result.output
+
+
 @pytest.mark.parametrize(
     ("more", "text"),
     [

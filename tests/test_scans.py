@@ -197,6 +197,75 @@ def test_a_resolution_that_is_given_stays(pile):
     assert fine.detect(pile.points, params, viewpoint=EYE).resolution == 1.7
 
 
+# What lies there always -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_grid", [False, True])
+def test_what_lies_in_the_empty_bin_is_not_searched(pile, part, is_grid):
+    empty = small_pile(VERTICES, FACES, num_parts=2)
+    np.testing.assert_array_equal(empty.poses, pile.poses[:2])
+    found = part.detect(pile.points, viewpoint=EYE, background=empty.grid if is_grid else empty.points)
+    assert num_right(found, pile.poses[2:], part) == 4
+    assert found.warnings == ()
+    # Table and fixtures are told of, at the voxel.
+    held = move(pile.poses[0], part.points)
+    gaps = np.linalg.norm(found.background[:, None] - held, axis=2).min(axis=1)
+    assert (gaps < part.voxel).sum() > 50
+    for pose in pile.poses[2:]:
+        upper = move(pose, part.points)
+        upper = upper[upper[:, 2] < np.median(upper[:, 2])]
+        gaps = np.linalg.norm(found.background[:, None] - upper, axis=2).min(axis=1)
+        assert (gaps < part.voxel / 2).sum() < 10
+
+
+def test_an_empty_bin_is_empty(part):
+    empty = small_pile(VERTICES, FACES, num_parts=2)
+    again = small_pile(VERTICES, FACES, num_parts=2, seed=0).points + RNG.normal(0, 0.1, empty.points.shape)
+    found = part.detect(again, viewpoint=EYE, background=empty.points)
+    assert len(found) == 0
+    assert len(part.detect(again, viewpoint=EYE)) == 2
+
+
+def test_a_background_without_a_point_is_none(pile, part):
+    with pytest.raises(ibi.InputError, match="background: it holds no point"):
+        part.detect(pile.points, viewpoint=EYE, background=np.full((4, 3), np.nan))
+    with pytest.raises(ibi.InputError, match=r"background has shape \(3,\)"):
+        part.detect(pile.points, viewpoint=EYE, background=[0, 0, 0])
+
+
+# The scan that a camera has smoothed ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tee():
+    mesh = ibi.io.read_mesh(EXAMPLES / "tee/model_tee_mesh.ply")
+    return mesh, ibi.io.read_cloud(EXAMPLES / "tee/tee6.ply")[0]
+
+
+@pytest.mark.parametrize("voxel", [0.003, 0.0038, 0.0042, 0.005])
+def test_any_voxel_finds_them(tee, voxel):
+    mesh, scan = tee
+    assert len(ibi.Model.from_mesh(*mesh, voxel=voxel).detect(scan, viewpoint=EYE)) == 6
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        lambda scan: scan,
+        lambda scan: scan + 1e-6,
+        lambda scan: scan[::2],
+        lambda scan: scan[::10],
+        lambda scan: np.zeros((50, 3)),
+        lambda scan: np.random.default_rng(0).uniform(scan.min(axis=0), scan.max(axis=0), (30, 3)),
+    ],
+    ids=["twice", "twins", "half twice", "a tenth twice", "pixels of nothing", "strays"],
+)
+def test_rows_that_are_none_change_nothing(tee, more):
+    mesh, scan = tee
+    found = ibi.Model.from_mesh(*mesh).detect(np.concatenate([scan, more(scan)]), viewpoint=EYE)
+    assert len(found) == 6
+
+
 # Which side is out ------------------------------------------------------------------------------------------
 
 

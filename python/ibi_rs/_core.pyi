@@ -142,9 +142,10 @@ def correspond(
     remove_plane: bool | None,
     check_units: bool,
     roi: tuple[_Floats, Sequence[float]] | None,
+    background: _Floats | None,
     num_threads: int | None,
-) -> tuple[_Floats, _Floats, _Ints, _Floats, float, list[str]]:
-    """Points, normals, [row of the model, row of the points], similarity, voxel, warnings."""
+) -> tuple[_Floats, _Floats, _Ints, _Floats, _Floats, float, list[str]]:
+    """Points, normals, [row of the model, row of the points], similarity, background, voxel, warnings."""
 
 def detect(
     model: Model,
@@ -156,11 +157,12 @@ def detect(
     remove_plane: bool | None,
     check_units: bool,
     roi: tuple[_Floats, Sequence[float]] | None,
+    background: _Floats | None,
     num_threads: int | None,
     on_round: Callable[[str], object] | None,
     own: Callable[[_Floats, _Ints], dict[str, Callable[..., object]]] | None,
 ) -> dict[str, Any]:
-    """As `register`; and ``warnings``, and ``resolution_set``, that of the parameters."""
+    """As `register`; and ``warnings``, ``background``, and ``resolution_set``, that of the parameters."""
 
 def detect_together(
     models: Models,
@@ -172,6 +174,7 @@ def detect_together(
     remove_plane: bool | None,
     check_units: bool,
     roi: tuple[_Floats, Sequence[float]] | None,
+    background: _Floats | None,
     num_threads: int | None,
     on_round: Callable[[str], object] | None,
     own: Sequence[Callable[[_Floats, _Ints], dict[str, Callable[..., object]]]],

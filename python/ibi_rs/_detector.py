@@ -35,7 +35,7 @@ class Detector:
     num_threads : int, default 1
         Of each scan. Ray and Dask have a worker for each core.
     **options
-        ``remove_plane``, ``check_units``, ``roi``, ``max_instances`` and ``timeout_s`` of
+        ``remove_plane``, ``check_units``, ``roi``, ``background``, ``max_instances`` and ``timeout_s`` of
         :meth:`Model.detect`, the same for all scans.
 
     Raises
@@ -63,7 +63,8 @@ class Detector:
     ) -> None:
         if errors not in ("row", "raise"):
             raise InputError(f"errors is {errors!r}; it must be 'row' or 'raise'")
-        wrong = set(options) - {"remove_plane", "check_units", "roi", "max_instances", "timeout_s"}
+        known = {"remove_plane", "check_units", "roi", "background", "max_instances", "timeout_s"}
+        wrong = set(options) - known
         if wrong:
             raise InputError(f"{min(wrong)} is no option of all scans; see Detector")
         if params is not None and not isinstance(params, Params):

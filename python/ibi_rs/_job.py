@@ -42,7 +42,7 @@ class Job:
         As in :func:`register` and :meth:`Model.detect`.
     tgt_frames, similarity : optional
         As in :func:`register`; only with ``corr``.
-    remove_plane, roi : optional
+    remove_plane, roi, background : optional
         As in :meth:`Model.detect`; only without ``corr``.
     num_threads : int, optional
         Default: what the batch gives each of its jobs.
@@ -76,6 +76,7 @@ class Job:
     viewpoint: npt.ArrayLike | None = None
     remove_plane: bool | None = None
     roi: Box | npt.ArrayLike | None = None
+    background: Points | None = None
     num_threads: int | None = None
     max_instances: int | None = None
     timeout_s: float | None = None
@@ -84,7 +85,7 @@ class Job:
     def __post_init__(self) -> None:
         if not isinstance(self.model, Model):
             raise TypeError(f"model must be ibi_rs.Model, not {type(self.model).__name__}")
-        idle = ("tgt_frames", "similarity") if self.corr is None else ("remove_plane", "roi")
+        idle = ("tgt_frames", "similarity") if self.corr is None else ("remove_plane", "roi", "background")
         for name in idle:
             if getattr(self, name) is not None:
                 word = "without" if self.corr is None else "with"
@@ -134,9 +135,12 @@ class Job:
             "callback": callback,
         }
         if self.corr is None:
-            return self.model.detect(
-                tgt, self.params, remove_plane=self.remove_plane, roi=self.roi, **options
-            )
+            wanted: dict[str, Any] = {
+                "remove_plane": self.remove_plane,
+                "roi": self.roi,
+                "background": self.background,
+            }
+            return self.model.detect(tgt, self.params, **wanted, **options)
         options |= {"tgt_frames": self.tgt_frames, "similarity": self.similarity}
         return self.model.register(tgt, self.corr, self.params, **options)
 

@@ -39,6 +39,9 @@ class Matches(_Matched):
         [row of the model's points, row of ``tgt``].
     similarity : (M,) float64
         As :func:`ibi_rs.match` gives it.
+    background : (K, 3) float64
+        What of the thinned scene was taken away: its table and walls, and what lies on the ``background``
+        that was given.
     voxel : float
         What the scene was thinned to, data units: :attr:`Model.voxel`, or more where the scan is coarser.
         Then :meth:`Model.detect` registers with a ``resolution`` of ``voxel / 1.25``, unless ``params`` has
@@ -47,14 +50,15 @@ class Matches(_Matched):
         What is doubtful about the scene, one line each.
     """
 
+    background: npt.NDArray[np.float64]
     voxel: float
     warnings: tuple[str, ...]
 
     @classmethod
     def _of(cls, raw: tuple[Any, ...]) -> Matches:
-        *arrays, voxel, warnings = raw
+        *arrays, background, voxel, warnings = raw
         matches = cls(*arrays)
-        matches.voxel, matches.warnings = voxel, tuple(warnings)
+        matches.background, matches.voxel, matches.warnings = background, voxel, tuple(warnings)
         return matches
 
 
@@ -65,6 +69,7 @@ def scan_arguments(
     remove_plane: bool | None,
     check_units: bool,
     roi: Box | npt.ArrayLike | None,
+    background: Points | None,
     num_threads: int | None,
 ) -> dict[str, Any]:
     """Check what the core is to be told of a scan."""
@@ -81,5 +86,6 @@ def scan_arguments(
         "remove_plane": None if remove_plane is None else bool(remove_plane),
         "check_units": bool(check_units),
         "roi": region(roi),
+        "background": None if background is None else _scan_rows("background", background),
         "num_threads": _num_threads(num_threads),
     }

@@ -255,6 +255,7 @@ class Model:
         remove_plane: bool | None = None,
         check_units: bool = True,
         roi: Box | npt.ArrayLike | None = None,
+        background: Points | None = None,
         num_threads: int | None = None,
     ) -> Matches:
         """Match a scene with this model, which needs normals: the first half of :meth:`detect`.
@@ -265,7 +266,7 @@ class Model:
 
         Parameters
         ----------
-        tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads
+        tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, background, num_threads
             As in :meth:`detect`.
 
         Returns
@@ -279,7 +280,9 @@ class Model:
         InputError, TypeError, ValueError
             Those of :meth:`detect`.
         """
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
+        scan = scan_arguments(
+            tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, background, num_threads
+        )
         matches = Matches._of(_core.correspond(self._core, **scan))
         for warning in matches.warnings:
             _log.LOGGER.warning("correspond: %s", warning)
@@ -299,6 +302,7 @@ class Model:
         remove_plane: bool | None = None,
         check_units: bool = True,
         roi: Box | npt.ArrayLike | None = None,
+        background: Points | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -334,6 +338,10 @@ class Model:
             What of the scan is looked into: a :class:`Box`, or the corners of the least and of the largest
             coordinates of one along the axes of the scan, data units. What lies outside is neither searched
             nor matched, but what was measured there still tells where there is nothing. By default all.
+        background : (M, 3) or (H, W, 3) array_like, optional
+            What the same camera measured of the empty bin, in the frame of ``tgt``. What lies within a voxel
+            of it is neither searched nor matched, as beyond a ``roi``. Points that are not finite are left
+            out.
         num_threads, max_instances, callback
             As in :func:`register`.
         timeout_s : float, optional
@@ -369,7 +377,9 @@ class Model:
         if params is None:
             params = _preset(viewpoint)
         params = _limited(params, max_instances, timeout_s)
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
+        scan = scan_arguments(
+            tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, background, num_threads
+        )
         own = params._own()
         raw = _core.detect(
             self._core,

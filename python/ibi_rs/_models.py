@@ -108,6 +108,7 @@ class Models(Sequence[Model]):
         remove_plane: bool | None = None,
         check_units: bool = True,
         roi: Box | npt.ArrayLike | None = None,
+        background: Points | None = None,
         num_threads: int | None = None,
         max_instances: int | None = None,
         timeout_s: float | None = None,
@@ -121,7 +122,7 @@ class Models(Sequence[Model]):
 
         Parameters
         ----------
-        tgt, params, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads
+        tgt, params, tgt_normals, viewpoint, remove_plane, check_units, roi, background, num_threads
             As in :meth:`Model.detect`.
         max_instances : int, optional
             Overrides that of ``params``; of each model.
@@ -150,7 +151,9 @@ class Models(Sequence[Model]):
         if params is None:
             params = _preset(viewpoint)
         params = _limited(params, max_instances, timeout_s)
-        scan = scan_arguments(tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, num_threads)
+        scan = scan_arguments(
+            tgt, tgt_normals, viewpoint, remove_plane, check_units, roi, background, num_threads
+        )
         own = params._own()
         parts, ranking, reason, message, total_s = _core.detect_together(
             self._core,
@@ -179,6 +182,7 @@ def detect(
     remove_plane: bool | None = None,
     check_units: bool = True,
     roi: Box | npt.ArrayLike | None = None,
+    background: Points | None = None,
     num_threads: int | None = None,
     max_instances: int | None = None,
     timeout_s: float | None = None,
@@ -193,7 +197,7 @@ def detect(
         A part, or a sequence or a mapping of parts, as in :class:`Models`; or :class:`Models`.
     names
         As in :class:`Models`.
-    tgt, params, tgt_normals, viewpoint, remove_plane, check_units, roi
+    tgt, params, tgt_normals, viewpoint, remove_plane, check_units, roi, background
         As in :meth:`Models.detect`.
     num_threads, max_instances, timeout_s, callback, reference
         As in :meth:`Models.detect`. The time does not count for the models, which are made first.
@@ -227,6 +231,7 @@ def detect(
         remove_plane=remove_plane,
         check_units=check_units,
         roi=roi,
+        background=background,
         num_threads=num_threads,
         max_instances=max_instances,
         timeout_s=timeout_s,

@@ -42,9 +42,15 @@ class Measures:
     noise : float
         Standard deviation of the scan across its surfaces, in voxels.
     blur : float
-        The noise times the spacing of the measured points, both in voxels: that of all in a voxel together.
+        The noise times the spacing of the measured points, both in 24ths of the part's diagonal: that of all
+        points in a detail together.
+    edges : float or None
+        How sharp the scan's edges are: near 1 where rays end on one surface or the other, small where the
+        camera has smoothed the step between them; None where hardly any edge is near.
     closeness, evidence : float
         As of a :class:`Pose`, among the points that no other pose owned then.
+    company : float
+        What other poses of the part that are sure by themselves add to the log odds: in coarse scans.
     """
 
     supported: int
@@ -59,8 +65,10 @@ class Measures:
     losses: tuple[float, float, float]
     noise: float
     blur: float
+    edges: float | None
     closeness: float
     evidence: float
+    company: float
 
     @classmethod
     def _of(cls, raw: dict[str, Any]) -> Measures:
@@ -78,8 +86,10 @@ class Measures:
             losses=tuple(raw["losses"]),
             noise=raw["noise"],
             blur=raw["blur"],
+            edges=raw["edges"],
             closeness=raw["closeness"],
             evidence=raw["evidence"],
+            company=raw["company"],
         )
 
 
@@ -431,9 +441,13 @@ class Registration(Sequence[Pose]):
         Names of the models, if they are of :class:`Models`; else empty.
     symmetries : tuple of Symmetries
         Those of each model by which the poses were turned least; empty where none were.
+    background : (K, 3) float64
+        What of the thinned scan :meth:`Model.detect` took away: table, walls, and what lies on the
+        ``background`` that was given. Of several models that of the first. Not in files.
     """
 
     symmetries: tuple[Symmetries, ...] = ()
+    background: npt.NDArray[np.float64] = np.empty((0, 3))
 
     def __init__(
         self,
@@ -532,7 +546,7 @@ class Registration(Sequence[Pose]):
             for text in texts
         }
         rounds = [part._rounds[1:-1] for part in parts if part._rounds != "[]"]
-        return cls(
+        whole = cls(
             poses,
             labels=np.concatenate(labels),
             rounds=f"[{','.join(rounds)}]",
@@ -546,6 +560,8 @@ class Registration(Sequence[Pose]):
             ],
             parts=dict(zip(names, parts, strict=True)),
         )
+        whole.background = parts[0].background
+        return whole
 
     @classmethod
     def _of(cls, raw: dict[str, Any], params: Params) -> Registration:
@@ -554,7 +570,7 @@ class Registration(Sequence[Pose]):
         raw = {**raw, "measures": measures, "free_motions": _free_motions(raw["free_motions"])}
         columns = [raw[field.name] for field in fields(Pose) if field.name in raw]
         rejected = zip(raw["rejected_poses"], json.loads(raw["rejected"]), strict=True)
-        return cls(
+        found = cls(
             list(map(Pose, *columns)),
             rejected=[
                 Rejected(pose, score, objection, found_in, of and Measures._of(of))
@@ -568,6 +584,8 @@ class Registration(Sequence[Pose]):
             params=params,
             warnings=raw.get("warnings", ()),
         )
+        found.background = raw.get("background", cls.background)
+        return found
 
     @cached_property
     def rounds(self) -> tuple[Round, ...]:

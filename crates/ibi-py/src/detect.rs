@@ -42,9 +42,16 @@ fn measured_rows<'py>(
     Ok((points, normals, measured.num_dropped, measured.num_without_normal))
 }
 
-/// Points, normals, [row of the model, row of the points], similarity, voxel, doubts.
-type Matched<'py> =
-    (Floats<'py>, Floats<'py>, Bound<'py, PyArray2<i64>>, Bound<'py, PyArray1<f64>>, f64, Vec<String>);
+/// Points, normals, [row of the model, row of the points], similarity, background, voxel, doubts.
+type Matched<'py> = (
+    Floats<'py>,
+    Floats<'py>,
+    Bound<'py, PyArray2<i64>>,
+    Bound<'py, PyArray1<f64>>,
+    Floats<'py>,
+    f64,
+    Vec<String>,
+);
 
 #[pyfunction]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's arguments; PyO3 owns
@@ -58,18 +65,20 @@ fn correspond<'py>(
     remove_plane: Option<bool>,
     check_units: bool,
     roi: Option<Place<'py>>,
+    background: Option<Rows<'py>>,
     num_threads: Option<usize>,
 ) -> PyResult<Matched<'py>> {
     let tgt = rows3(&tgt, Point3::new)?;
     let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_deref())?;
-    let roi = region(roi)?;
-    let options = Detect { remove_plane, check_units, roi, ..Detect::default() };
+    let (roi, background) = (region(roi)?, empty(background)?);
+    let options = Detect { remove_plane, check_units, roi, background, ..Detect::default() };
     let matched = in_pool(py, num_threads, |interrupt| model.0.correspond(&scan, &options, interrupt))?;
     Ok((
         vectors(py, matched.points.into_iter().map(Into::into))?,
         vectors(py, matched.normals.into_iter().map(Into::into))?,
         pairs(py, matched.matches.rows)?,
         matched.matches.similarity.into_pyarray(py),
+        vectors(py, matched.background.into_iter().map(Into::into))?,
         matched.voxel,
         matched.doubts.iter().map(Doubt::to_string).collect(),
     ))
@@ -84,7 +93,11 @@ fn region(roi: Option<Place<'_>>) -> PyResult<Option<Roi>> {
     roi.map(of).transpose()
 }
 
-/// As `register`, with `warnings` and `resolution_set`, that of the parameters. `own` is called with the points and the
+fn empty(background: Option<Rows<'_>>) -> PyResult<Option<Vec<Point3<f64>>>> {
+    background.map(|rows| rows3(&rows, Point3::new)).transpose()
+}
+
+/// As `register`, with `warnings`, `background` and `resolution_set`, that of the parameters. `own` is called with the points and the
 /// correspondences that are registered, and returns the callables that stand for stages.
 #[pyfunction]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)] // Python's arguments; PyO3 owns
@@ -99,6 +112,7 @@ fn detect<'py>(
     remove_plane: Option<bool>,
     check_units: bool,
     roi: Option<Place<'py>>,
+    background: Option<Rows<'py>>,
     num_threads: Option<usize>,
     on_round: Option<Py<PyAny>>,
     own: Option<Py<PyAny>>,
@@ -106,9 +120,10 @@ fn detect<'py>(
     let params = Some(params::parse(params)?);
     let tgt = rows3(&tgt, Point3::new)?;
     let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_deref())?;
-    let roi = region(roi)?;
+    let (roi, background) = (region(roi)?, empty(background)?);
     let found = observed(py, on_round.as_ref(), |cancel, caller, observer| {
-        let options = Detect { params, remove_plane, check_units, roi, run: run(cancel, num_threads) };
+        let options =
+            Detect { params, remove_plane, check_units, roi, background, run: run(cancel, num_threads) };
         let set_up = |registrar, matched: &MatchedScan| own_stages(registrar, matched, own, &caller);
         model.0.detect_with(&scan, &options, set_up, observer)
     })?;
@@ -130,6 +145,7 @@ fn detect_together<'py>(
     remove_plane: Option<bool>,
     check_units: bool,
     roi: Option<Place<'py>>,
+    background: Option<Rows<'py>>,
     num_threads: Option<usize>,
     on_round: Option<Py<PyAny>>,
     own: Vec<Py<PyAny>>,
@@ -137,9 +153,10 @@ fn detect_together<'py>(
     let params = Some(params::parse(params)?);
     let tgt = rows3(&tgt, Point3::new)?;
     let scan = scan(&tgt, tgt_normals.as_ref(), viewpoint, measured.as_deref())?;
-    let roi = region(roi)?;
+    let (roi, background) = (region(roi)?, empty(background)?);
     let found = observed(py, on_round.as_ref(), |cancel, caller, observer| {
-        let options = Detect { params, remove_plane, check_units, roi, run: run(cancel, num_threads) };
+        let options =
+            Detect { params, remove_plane, check_units, roi, background, run: run(cancel, num_threads) };
         let mut own: Vec<Option<Py<PyAny>>> = own.into_iter().map(Some).collect();
         let set_up = |at: usize, registrar, matched: &MatchedScan| {
             let own = own.get_mut(at).and_then(Option::take);
@@ -172,5 +189,7 @@ fn detected<'py>(py: Python<'py>, found: &Detection) -> PyResult<Bound<'py, PyDi
     let result = to_dict(py, &found.registration)?;
     result.set_item("warnings", found.doubts().map(Doubt::to_string).collect::<Vec<_>>())?;
     result.set_item("resolution_set", found.params.resolution)?;
+    let background = found.scan.as_ref().map_or(&[][..], |scan| &scan.background);
+    result.set_item("background", vectors(py, background.iter().copied().map(Into::into))?)?;
     Ok(result)
 }

@@ -30,6 +30,7 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    Background,
     CameraOf,
     Crop,
     DepthScale,
@@ -78,6 +79,7 @@ def batch(
     remove_plane: RemovePlane = None,
     remove_planes: RemovePlanes = None,
     crop: Crop = None,
+    background: Background = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
@@ -147,12 +149,12 @@ def batch(
         depth_scale,
         remove_planes,
         unit,
+        background,
     )
     start = time.perf_counter()
     targets = _targets(scenes, output)
-    try_outputs(
-        {"--bop": bop}, {"MODEL": model, "--params": params} | {f"scan {scene}": scene for scene in scenes}
-    )
+    inputs = {"MODEL": model, "--params": params, "--background": background}
+    try_outputs({"--bop": bop}, inputs | {f"scan {scene}": scene for scene in scenes})
     _try_folder(output, targets)
     part = search.model(model, None)
     mm = 0.0 if bop is None else millimetres(unit, part.diameter)

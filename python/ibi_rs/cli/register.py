@@ -23,6 +23,7 @@ from .outputs import (
     write_json,
 )
 from .search import (
+    Background,
     CameraOf,
     Crop,
     DepthScale,
@@ -76,6 +77,7 @@ def register(
     remove_plane: RemovePlane = None,
     remove_planes: RemovePlanes = None,
     crop: Crop = None,
+    background: Background = None,
     symmetries: SymmetriesOf = "none",
     preset: Preset = None,
     params: ParamsFile = None,
@@ -130,7 +132,7 @@ def register(
     model = models[0]
     if corr is not None and (voxel is not None or remove_plane is not None or from_all_sides):
         misused("--corr brings the matches: --voxel, --remove-plane and --from-all-sides have no say then")
-    idle = {"--crop": crop, "--camera": camera, "--remove-planes": remove_planes}
+    idle = {"--crop": crop, "--background": background, "--camera": camera, "--remove-planes": remove_planes}
     if corr is not None and any(value is not None for value in idle.values()):
         names = [name for name, value in idle.items() if value is not None]
         misused(f"--corr brings the matches: {', '.join(names)} has no say then")
@@ -153,10 +155,12 @@ def register(
         depth_scale,
         remove_planes,
         unit,
+        background,
     )
     outputs = {"--output": output, "--bop": bop, "--plot": plot, "--html": html, "--rerun": rerun}
-    inputs = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
-    try_outputs(outputs, {**inputs, "SCENE": scene, "--corr": corr, "--params": params})
+    inputs: dict[str, Path | None] = {"MODEL" if len(models) == 1 else f"MODEL {one}": one for one in models}
+    inputs |= {"SCENE": scene, "--corr": corr, "--params": params, "--background": background}
+    try_outputs(outputs, inputs)
     options = search.limits(threads)
     pairs: Any = None
     with Progress("reading") as progress:

@@ -19,6 +19,7 @@ from ibi_rs._log import LOGGER
 from ibi_rs._written import METRES, checked_unit
 from ibi_rs.symmetries import _bop_entry as bop_entry
 
+from .outputs import sha256
 from .terminal import misused, warn
 
 SYMMETRIES = "find, none, or BOP's models_info.json, with :ID where it has several objects"
@@ -51,6 +52,12 @@ Crop = Annotated[
         help="Look only into a box along the axes of SCENE: its least corner and its largest one, "
         "x0,y0,z0,x1,y1,z1 or six numbers.",
         metavar="X0 Y0 Z0 X1 Y1 Z1",
+    ),
+]
+Background = Annotated[
+    Path | None,
+    typer.Option(
+        help="The empty bin as the same camera measured it: what lies on it is not searched.",
     ),
 ]
 CameraOf = Annotated[
@@ -237,6 +244,7 @@ class Search:
     depth_scale: float | None = None
     remove_planes: int | None = None
     unit: str | None = None
+    background: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse now what would be refused once the files are read."""
@@ -331,7 +339,13 @@ class Search:
             "viewpoint": None if self.from_all_sides else self.viewpoint or place,
             "remove_plane": self.remove_plane,
             "roi": None if self.crop is None else np.reshape(self.crop, (2, 3)),
+            "background": self._empty,
         }
+
+    @cached_property
+    def _empty(self) -> Any:
+        """The points of --background."""
+        return None if self.background is None else self.read(self.background).points
 
     @cached_property
     def params(self) -> ibi.Params | None:
@@ -365,6 +379,7 @@ class Search:
             "camera": self.camera,
             "depth_scale": self.depth_scale,
             "remove_planes": self.remove_planes,
+            "background_sha256": None if self.background is None else sha256(self.background),
         }
 
     def limits(self, num_threads: int | None) -> dict[str, Any]:

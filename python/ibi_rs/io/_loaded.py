@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from ._reading import Floats, check_count, extra
 def opened(path: Path, ply: _ply.Ply | None, **options: Any) -> Any:
     """Load without merging; for text of another encoding than UTF-8 trimesh wants a library more."""
     trimesh = extra("trimesh")
+    # What it takes for worth a line is an error of ours, or nothing; without a handler Python prints it.
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
     suffix = path.suffix.lower()
     if ply is not None and (outlines := mixed(ply)) is not None:
         points, polygons = outlines

@@ -118,7 +118,10 @@ def _check_off(path: Path) -> None:
     lines = off_lines(path)
     counts = off_counts(lines)
     check_count(counts[0], min(len(lines) - 1, counts[0]), "vertices")
-    check_count(counts[1], len(lines) - 1 - counts[0], "faces")
+    faces = lines[1 + counts[0] :]
+    check_count(counts[1], len(faces), "faces")
+    cut = [line for line in faces[: counts[1]] if line[0].isdecimal() and len(line) <= int(line[0])]
+    check_count(counts[1], counts[1] - len(cut), "whole faces")
 
 
 def off_lines(path: Path) -> list[list[str]]:

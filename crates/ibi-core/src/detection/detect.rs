@@ -9,9 +9,9 @@ use super::doubts::{self, Doubt};
 use super::model::{DIM, Model};
 use super::roi::Roi;
 use super::scan::standing;
-use super::shared::{Shared, Wanted};
+use super::shared::{Shared, Told, Wanted};
 use super::{DetectionError, Origin, Run, VOXELS_PER_SPACING, sides};
-use crate::features::{Descriptors, FeatureError, Matches, Matching, match_features};
+use crate::features::{Descriptors, FeatureError, Matches, Matching, match_features, voxel_downsample};
 use crate::interrupt::Interrupt;
 use crate::kernels::par::Pool;
 use crate::params::Params;
@@ -48,19 +48,30 @@ pub struct Detect {
     pub check_units: bool,
     /// What of the scan is looked into; `None`: all of it.
     pub roi: Option<Roi>,
+    /// What the same camera measured without the parts, an empty bin: what lies within a voxel of it (of the finest model) is not searched, nor
+    /// matched, but it stays in what was measured. Points that are not finite are none.
+    pub background: Option<Vec<Point3<f64>>>,
     /// Threads, and how to end it.
     pub run: Run,
 }
 
 impl Default for Detect {
     fn default() -> Self {
-        Self { params: None, remove_plane: None, check_units: true, roi: None, run: Run::default() }
+        Self {
+            params: None,
+            remove_plane: None,
+            check_units: true,
+            roi: None,
+            background: None,
+            run: Run::default(),
+        }
     }
 }
 
 impl Detect {
     pub(super) fn wanted(&self, is_sided: bool) -> Wanted<'_> {
-        Wanted { roi: self.roi.as_ref(), remove_plane: self.remove_plane, is_sided }
+        let background = self.background.as_deref();
+        Wanted { roi: self.roi.as_ref(), background, remove_plane: self.remove_plane, is_sided }
     }
 
     /// Those that were given, or those that fit the scan; checked.
@@ -83,6 +94,8 @@ pub struct MatchedScan {
     pub normals: Vec<Vector3<f64>>,
     /// [row of the model, row of `points`], and how alike they are.
     pub matches: Matches,
+    /// What of the thinned scan was taken away: its table and walls, and what lies on the background that was given.
+    pub background: Vec<Point3<f64>>,
     /// What the scan was thinned to, data units: the model's voxel, or more where the scan is coarser.
     pub voxel: f64,
     /// What is doubtful about the scan, and about the model.
@@ -145,7 +158,7 @@ impl Model {
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
         let wanted = options.wanted(params.oriented_normals);
-        let shared = pool.install(|| Shared::new(scan, wanted, || self.told(&interrupt)));
+        let shared = pool.install(|| Shared::new(scan, wanted, || self.told(&interrupt), &interrupt));
         drop(pool);
         match shared {
             Ok(mut shared) => self.search(&mut shared, options, params, start, set_up, observer),
@@ -218,13 +231,14 @@ impl Model {
         interrupt: &Interrupt,
     ) -> Result<MatchedScan, DetectionError> {
         self.check()?;
-        let mut shared = Shared::new(scan, options.wanted(false), || self.told(interrupt))?;
+        let mut shared = Shared::new(scan, options.wanted(false), || self.told(interrupt), interrupt)?;
         self.matched(&mut shared, options.check_units, interrupt)
     }
 
-    /// Its diameter and its faces.
-    pub(super) fn told(&self, interrupt: &Interrupt) -> Result<(f64, Vec<[f64; 2]>), DetectionError> {
-        Ok((self.diameter(interrupt)?, self.faces(interrupt)?.to_vec()))
+    /// What a scan has to know of it.
+    pub(super) fn told(&self, interrupt: &Interrupt) -> Result<Told, DetectionError> {
+        let (diameter, faces) = (self.diameter(interrupt)?, self.faces(interrupt)?.to_vec());
+        Ok(Told { voxel: self.voxel(), diameter, faces })
     }
 
     /// Whether it can be detected.
@@ -243,8 +257,8 @@ impl Model {
         if check_units {
             doubts::check_units(diameter, &shared.all)?;
         }
-        let (num_dropped, num_searched) = (shared.searched.num_dropped, shared.searched.points.len());
-        let num_points = shared.all.len();
+        let (num_dropped, num_in_roi) = (shared.searched.num_dropped, shared.num_in_roi);
+        let (num_points, num_given) = (shared.all.len(), shared.scan.points.len());
         let ready = shared.at(self.voxel(), interrupt)?;
         let (voxel, num_left) = (ready.prepared.voxel, ready.prepared.points.len());
         let holds_nothing = num_left < MIN_POINTS || across(&ready.prepared.points) <= self.source().spacing;
@@ -266,12 +280,12 @@ impl Model {
 
         let mut doubts = Vec::new();
         if num_dropped > 0 {
-            doubts.push(Doubt::NotFinite { num_dropped, num_given: num_dropped + num_points });
+            doubts.push(Doubt::NotFinite { num_dropped, num_given });
         }
         if num_points < MIN_POINTS {
             doubts.push(Doubt::FewPoints { num_points });
-        } else if num_searched < MIN_POINTS {
-            doubts.push(Doubt::FewInRoi { num_points: num_searched, num_given: num_points });
+        } else if num_in_roi < MIN_POINTS {
+            doubts.push(Doubt::FewInRoi { num_points: num_in_roi, num_given: num_points });
         } else if holds_nothing {
             doubts.push(Doubt::Nothing);
         } else if !is_known {
@@ -286,8 +300,10 @@ impl Model {
         }
         doubts.extend(ready.doubt.clone());
         let (points, of_points) = (ready.prepared.points.clone(), ready.prepared.normals.clone());
+        let mut background = ready.prepared.taken_away.clone();
+        background.extend(voxel_downsample(&shared.on_background, None, voxel, interrupt)?.points);
         doubts.extend(self.normals_doubt(normals, interrupt)?);
-        Ok(MatchedScan { points, normals: of_points, matches, voxel, doubts })
+        Ok(MatchedScan { points, normals: of_points, matches, background, voxel, doubts })
     }
 
     /// Whether the normals of a cloud point inwards; those of a mesh were turned.

@@ -62,6 +62,9 @@ pub enum DetectionError {
     /// A box that is nowhere.
     #[error("roi: its place must be finite")]
     RoiPlace,
+    /// A background without a point.
+    #[error("background: it holds no point")]
+    NoBackground,
     /// The scan cannot be in the unit of the model.
     #[error(
         "tgt: the scene is {} across and the model {}; are they in the same unit? (Metres for millimetres are a factor of 1000; check_units off takes them as they are.)",

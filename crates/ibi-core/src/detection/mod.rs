@@ -30,6 +30,7 @@ mod shared;
 mod sides;
 mod standpoints;
 mod surface;
+mod twins;
 
 pub use detect::{Detect, Detection, MatchedScan};
 pub use doubts::Doubt;

@@ -9,7 +9,7 @@ use nalgebra::Point3;
 use super::detect::{Detect, Detection, MatchedScan};
 use super::model::Model;
 use super::rivals::{Rival, outdone};
-use super::shared::Shared;
+use super::shared::{Shared, Told};
 use super::{DetectionError, Doubt};
 use crate::evidence::Measures;
 use crate::evidence::explained::{Reach, Shape, explained};
@@ -137,18 +137,23 @@ impl Models {
         let interrupt = options.run.interrupt().with_timeout(start, params.timeout_s);
         let pool = Pool::new(options.run.num_threads)?;
         let told = || {
-            self.models().try_fold((0.0, Vec::new()), |(most, mut faces): (f64, _), model| {
-                let (diameter, of_model) = model.told(&interrupt)?;
-                faces.extend(of_model);
-                Ok((most.max(diameter), faces))
+            let none = Told { voxel: f64::INFINITY, diameter: 0.0, faces: Vec::new() };
+            self.models().try_fold(none, |all, model| {
+                let Told { voxel, diameter, faces } = model.told(&interrupt)?;
+                Ok(Told {
+                    voxel: all.voxel.min(voxel),
+                    diameter: all.diameter.max(diameter),
+                    faces: [all.faces, faces].concat(),
+                })
             })
         };
-        let mut shared =
-            match pool.install(|| Shared::new(scan, options.wanted(params.oriented_normals), told)) {
-                Ok(shared) => Some(shared),
-                Err(error) if error.is_interrupted() => None,
-                Err(error) => return Err(error),
-            };
+        let mut shared = match pool
+            .install(|| Shared::new(scan, options.wanted(params.oriented_normals), told, &interrupt))
+        {
+            Ok(shared) => Some(shared),
+            Err(error) if error.is_interrupted() => None,
+            Err(error) => return Err(error),
+        };
         drop(pool);
         let mut is_ended = false;
         let mut parts: Vec<Detection> = Vec::with_capacity(self.parts.len());

@@ -7,6 +7,7 @@ use nalgebra::{Point3, Vector3};
 use super::bodies::{Body, bodies};
 use super::extent::extent;
 use super::faces::{faces, is_larger};
+use super::twins::distinct;
 use super::{DetectionError, VOXELS_PER_SPACING};
 use crate::error::{Argument, Error};
 use crate::features::{
@@ -80,11 +81,37 @@ impl Measured {
         Ok(Self { points, normals, num_dropped, num_without_normal })
     }
 
+    /// Each point once.
+    pub(super) fn distinct(self) -> Self {
+        match distinct(&self.points) {
+            Some(rows) => self.picked(&rows),
+            None => self,
+        }
+    }
+
     /// The points that are wanted.
     pub(super) fn within(self, is_wanted: impl Fn(&Point3<f64>) -> bool) -> Self {
         let rows: Vec<usize> = (0..self.points.len()).filter(|&row| is_wanted(&self.points[row])).collect();
-        let normals = self.normals.map(|normals| picked(&normals, &rows));
-        Self { points: picked(&self.points, &rows), normals, ..self }
+        self.picked(&rows)
+    }
+
+    /// The points that do not lie within `distance` of a background, and those that do.
+    pub(super) fn off(
+        self,
+        background: &[Point3<f64>],
+        distance: f64,
+        interrupt: &Interrupt,
+    ) -> Result<(Self, Vec<Point3<f64>>), DetectionError> {
+        let near = Nearby::until(background, distance, distance, || interrupt.is_set());
+        let is_on = near.ok_or(FeatureError::Interrupted)?.any_within_each(distance, &self.points);
+        let (on, off): (Vec<usize>, Vec<usize>) = (0..is_on.len()).partition(|&row| is_on[row]);
+        let on = picked(&self.points, &on);
+        Ok((self.picked(&off), on))
+    }
+
+    fn picked(self, rows: &[usize]) -> Self {
+        let normals = self.normals.map(|normals| picked(&normals, rows));
+        Self { points: picked(&self.points, rows), normals, ..self }
     }
 }
 
@@ -116,6 +143,8 @@ pub(super) struct Prepared {
     pub(super) whole: Vec<Point3<f64>>,
     /// If they were given.
     pub(super) whole_normals: Option<Vec<Vector3<f64>>>,
+    /// Its table and its walls.
+    pub(super) taken_away: Vec<Point3<f64>>,
     /// Whether nearly all of it lies behind a table, as seen from the viewpoint.
     pub(super) is_behind_table: bool,
 }
@@ -141,7 +170,7 @@ impl Prepared {
     ) -> Result<Self, DetectionError> {
         let given = setting.voxel;
         let mut voxel = given;
-        let (whole, left, is_behind_table) = loop {
+        let (whole, mut left, is_behind_table) = loop {
             let normals = measured.normals.as_deref();
             let whole = voxel_downsample(&measured.points, normals, voxel, interrupt)?;
             let table = Table::of(&whole.points, voxel, setting, interrupt)?;
@@ -180,9 +209,16 @@ impl Prepared {
             }
             let rows: Vec<usize> = (0..points.len()).filter(|&row| stays[row]).collect();
             (points, normals) = (picked(&points, &rows), picked(&normals, &rows));
+            left = picked(&left, &rows);
         }
+        let mut is_left = vec![false; whole.points.len()];
+        for &row in &left {
+            is_left[row] = true;
+        }
+        let gone: Vec<usize> = (0..is_left.len()).filter(|&row| !is_left[row]).collect();
+        let taken_away = picked(&whole.points, &gone);
         let (whole, whole_normals) = (whole.points, whole.normals);
-        Ok(Self { points, normals, voxel, whole, whole_normals, is_behind_table })
+        Ok(Self { points, normals, voxel, whole, whole_normals, taken_away, is_behind_table })
     }
 }
 

@@ -1,5 +1,6 @@
 //! A scan as it is prepared for one model or several: what they have in common is worked out once.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
@@ -11,6 +12,7 @@ use super::model::describe;
 use super::roi::Roi;
 use super::scan::{Measured, Prepared, Setting};
 use super::standpoints::standpoints;
+use super::twins::distinct;
 use crate::error::Argument;
 use crate::interrupt::Interrupt;
 use crate::scene::{Cloud, Measurement, check_points};
@@ -25,8 +27,10 @@ pub(super) struct Shared<'a> {
     pub(super) all: Vec<Point3<f64>>,
     /// If normals were given.
     normals_of_all: Option<Vec<Vector3<f64>>>,
-    /// What of that is searched: all, or what lies in the region of interest.
+    /// What of that is searched: all, or what lies in the region of interest and not on the background.
     pub(super) searched: Measured,
+    pub(super) num_in_roi: usize,
+    pub(super) on_background: Vec<Point3<f64>>,
     /// Of the largest of the models.
     diameter: f64,
     faces: Vec<[f64; 2]>,
@@ -38,9 +42,21 @@ pub(super) struct Shared<'a> {
 pub(super) struct Wanted<'a> {
     /// What lies in it is searched.
     pub(super) roi: Option<&'a Roi>,
+    /// What lies on it is not.
+    pub(super) background: Option<&'a [Point3<f64>]>,
     pub(super) remove_plane: Option<bool>,
     /// Whether it counts which side of a surface was seen.
     pub(super) is_sided: bool,
+}
+
+/// What a scan has to know of the models.
+pub(super) struct Told {
+    /// The least of them, data units.
+    pub(super) voxel: f64,
+    /// Of the largest.
+    pub(super) diameter: f64,
+    /// How long and how wide their faces are.
+    pub(super) faces: Vec<[f64; 2]>,
 }
 
 /// A scan at a voxel.
@@ -53,11 +69,12 @@ pub(super) struct Ready {
 }
 
 impl<'a> Shared<'a> {
-    /// Checks a scan. `model`: the diameter of the largest model, and the faces of all.
+    /// Checks a scan.
     pub(super) fn new(
         scan: &'a Cloud<'a>,
-        Wanted { roi, remove_plane, is_sided }: Wanted<'_>,
-        model: impl FnOnce() -> Result<(f64, Vec<[f64; 2]>), DetectionError>,
+        Wanted { roi, background, remove_plane, is_sided }: Wanted<'_>,
+        models: impl FnOnce() -> Result<Told, DetectionError>,
+        interrupt: &Interrupt,
     ) -> Result<Self, DetectionError> {
         if scan.viewpoints.is_empty() && scan.normals.is_none() {
             return Err(DetectionError::NoSide);
@@ -65,13 +82,21 @@ impl<'a> Shared<'a> {
         if let Some(roi) = roi {
             roi.check()?;
         }
-        let measured = Measured::of(&scan.points, scan.normals.as_deref())?;
+        let measured = Measured::of(&scan.points, scan.normals.as_deref())?.distinct();
+        // Many a camera writes its own place where it has measured nothing.
+        let measured = measured.within(|point| !scan.viewpoints.contains(point));
         check_points(&measured.points, Argument::Tgt)?;
         if scan.normals.is_some() && measured.normals.is_none() {
             let (num_missing, len) = (measured.num_without_normal, measured.points.len());
             return Err(DetectionError::MostNormalsMissing { num_missing, len });
         }
-        let (diameter, faces) = model()?;
+        let background: Option<Vec<_>> = background.map(|points| {
+            points.iter().copied().filter(|point| point.iter().all(|x| x.is_finite())).collect()
+        });
+        if background.as_ref().is_some_and(Vec::is_empty) {
+            return Err(DetectionError::NoBackground);
+        }
+        let Told { voxel, diameter, faces } = models()?;
         let viewpoints = match &measured.normals {
             Some(normals) if scan.viewpoints.is_empty() && is_sided => {
                 standpoints(&measured.points, normals, diameter)
@@ -80,9 +105,14 @@ impl<'a> Shared<'a> {
         };
         let all = measured.points.clone();
         let normals_of_all = measured.normals.clone();
-        let searched = match roi {
+        let in_roi = match roi {
             Some(roi) => measured.within(|point| roi.contains(point)),
             None => measured,
+        };
+        let num_in_roi = in_roi.points.len();
+        let (searched, on_background) = match background {
+            Some(background) => in_roi.off(&background, voxel, interrupt)?,
+            None => (in_roi, Vec::new()),
         };
         Ok(Self {
             scan,
@@ -91,6 +121,8 @@ impl<'a> Shared<'a> {
             all,
             normals_of_all,
             searched,
+            num_in_roi,
+            on_background,
             diameter,
             faces,
             ready: BTreeMap::new(),
@@ -107,7 +139,13 @@ impl<'a> Shared<'a> {
     pub(super) fn measurement(&self) -> Measurement<'_> {
         match &self.scan.measured.parts[..] {
             [] => Measurement { parts: vec![self.all[..].into()], normals: self.normals_of_all.clone() },
-            _ => self.scan.measured.clone(),
+            parts => {
+                let once = |part: &Cow<'a, [Point3<f64>]>| {
+                    let rows = distinct(part);
+                    rows.map_or_else(|| part.clone(), |rows| rows.into_iter().map(|row| part[row]).collect())
+                };
+                Measurement { parts: parts.iter().map(once).collect(), ..self.scan.measured.clone() }
+            }
         }
     }
 

@@ -3,8 +3,8 @@
 use nalgebra::{Isometry3, Matrix6, Point3, Vector3};
 
 use super::contour::{Contour, Placed, Rim, Scan, contour, overrun, run_on};
-use super::noise::{noise_of_rays, spacing_of_rays};
-use super::odds::{BLURRED, Measures};
+use super::noise::{noise_of_rays, sharpness_of_edges, spacing_of_rays};
+use super::odds::{Measures, is_blurred};
 use super::rays::{Rays, visible};
 use super::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
 use super::settle::{Steps, settle};
@@ -26,6 +26,7 @@ pub(crate) struct Closeup {
     voxel: f64,
     noise: f64,
     blur: f64,
+    edges: Option<f64>,
     tolerance: Tolerance,
 }
 
@@ -38,6 +39,16 @@ pub(crate) struct Proof {
     /// Share of the source that is supported.
     pub(crate) explained: f64,
 }
+
+impl Proof {
+    /// The same in such company, see [`company`](super::odds::company).
+    pub(crate) fn among(self, company: f64) -> Self {
+        Self { measures: self.measures.among(company), ..self }
+    }
+}
+
+/// Across a part: a detail is as wide as a voxel is, as a rule.
+const DETAILS: f64 = 24.0;
 
 /// A cloud that was thinned to a voxel has its points so many of them apart, about.
 const VOXELS_PER_SPACING: f64 = 1.25;
@@ -98,15 +109,18 @@ impl Closeup {
         let voxel = VOXELS_PER_SPACING * scene.resolution;
         // Of what the target is: a table that was taken away may be smoother than the parts, or rougher.
         let noise = noise_of_rays(&rays[0], &scene.target.points);
-        let blur = noise / voxel * (spacing_of_rays(&rays[0], &scene.target.points, voxel) / voxel);
-        if blur >= BLURRED && of_all.is_none() {
+        // Against the part, whose voxel may have been chosen.
+        let detail = scene.source.extent / DETAILS;
+        let blur = noise * spacing_of_rays(&rays[0], &scene.target.points, voxel) / detail.powi(2);
+        let edges = sharpness_of_edges(&rays[0], &scene.target.points, &scene.near_target, voxel);
+        if is_blurred(blur, edges) && of_all.is_none() {
             return None;
         }
         let tolerance = Tolerance::of(voxel, noise);
         let tolerance = Tolerance { aside: tolerance.aside.max(spacing), ..tolerance };
         let reach = (RIM_VOXELS * voxel).max(RIM_TOLERANCES * tolerance.across);
         let rim = Rim::new(&scene.source.points, normals, reach, FALLEN_TOLERANCES * tolerance.across);
-        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, blur, tolerance })
+        Some(Self { rays, is_fused: of_all.is_some(), rim, voxel, noise, blur, edges, tolerance })
     }
 
     /// A pose settled, and what was measured of it.
@@ -158,6 +172,7 @@ impl Closeup {
                 losses: losses_of,
                 noise: noise / voxel,
                 blur: self.blur,
+                edges: self.edges,
                 is_fused: self.is_fused,
                 ..Measures::default()
             },

@@ -50,6 +50,51 @@ pub fn spacing_of_rays(rays: &Rays, points: &[Point3<f64>], radius: f64) -> f64 
     (std::f64::consts::PI / most).sqrt() * radius
 }
 
+/// An edge is a disc of rays, this wide and this deep, voxels; and so few rays or edges tell nothing.
+const EDGE_RADIUS: f64 = 1.5;
+const EDGE_DEPTH: f64 = 4.0;
+const FEW_RAYS: usize = 6;
+const FEW_EDGES: usize = 30;
+
+/// A ray is one of those that the points were made of if it ends so near to one, voxels. Among those alone steps are not as deep, and edges
+/// less sharp by so much: of piles of the tuning half they have 0.33 to 0.60 for 0.45 to 0.75.
+const OWN: f64 = 2.0;
+const OWN_LESS: f64 = 0.12;
+
+/// How sharp the edges are at which one surface ends before another: of all discs of rays 1.5 voxels about some of the points, whose ends
+/// span 4 voxels in depth, the mean share of that span that no ray ends in. Near 1 where rays end on one surface or the other, and small
+/// where what measured has smoothed the step (a window of stereo, light that spreads) and rays end all over it. What is told by the rays
+/// that the points were made of, those of `nearby`, counts if it is less: what they lie on may have been measured otherwise. `None` where
+/// there is hardly an edge.
+#[must_use]
+pub fn sharpness_of_edges(rays: &Rays, points: &[Point3<f64>], nearby: &Nearby, voxel: f64) -> Option<f64> {
+    let [mut of_all, mut of_own] = [const { Vec::new() }; 2];
+    for point in points.iter().step_by(points.len().div_ceil(SAMPLE).max(1)) {
+        let angle = (EDGE_RADIUS * voxel / (point - rays.eye()).norm()).min(MAX_ANGLE);
+        let mut ends = Vec::new();
+        rays.each_near(point, angle, |end, _| ends.push(*end));
+        let gap = widest_gap(ends.iter().map(Vector3::norm), voxel);
+        if gap.is_none() {
+            continue;
+        }
+        of_all.extend(gap);
+        let is_own = |end: &&Vector3<f64>| nearby.within(&(rays.eye() + *end), OWN * voxel).next().is_some();
+        of_own.extend(widest_gap(ends.iter().filter(is_own).map(Vector3::norm), voxel));
+    }
+    let mean = |gaps: &[f64]| (gaps.len() >= FEW_EDGES).then(|| gaps.iter().sum::<f64>() / gaps.len() as f64);
+    let of_own = mean(&of_own).map_or(f64::INFINITY, |of_own| of_own + OWN_LESS);
+    mean(&of_all).map(|of_all| of_all.min(of_own))
+}
+
+/// The widest gap between ranges that span the depth of an edge, in spans.
+fn widest_gap(ranges: impl Iterator<Item = f64>, voxel: f64) -> Option<f64> {
+    let mut ranges: Vec<f64> = ranges.collect();
+    ranges.sort_unstable_by(f64::total_cmp);
+    let span = ranges.last()? - ranges[0];
+    let is_edge = ranges.len() >= FEW_RAYS && span >= EDGE_DEPTH * voxel;
+    is_edge.then(|| ranges.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max) / span)
+}
+
 /// The same as [`noise_of_rays`] of a scan that no single eye made: of the 12 nearest points, within the reach of `nearby`, which holds the points.
 #[must_use]
 pub fn noise_of_cloud(points: &[Point3<f64>], nearby: &Nearby) -> f64 {

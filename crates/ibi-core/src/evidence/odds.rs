@@ -18,14 +18,19 @@ pub struct Measures {
     pub losses: [f64; 3],
     /// Standard deviation of the scan across its surfaces, voxels.
     pub noise: f64,
-    /// That of as many points as there are in a voxel, together: the noise times their spacing, both in voxels.
+    /// That of as many points as there are in a detail of the part, together: the noise times their spacing, both in 24ths of the part's
+    /// diagonal.
     pub blur: f64,
+    /// How sharp the scan's edges are, see [`super::noise::sharpness_of_edges`].
+    pub edges: Option<f64>,
     /// Whether the scan was fused from what several cameras measured, or one that went about.
     pub is_fused: bool,
     /// How close its points lie on the thinned clouds, see [`super::Support::closeness`].
     pub closeness: f64,
     /// -log10 of the chance that as many correspondences would agree, see [`super::Support::evidence`].
     pub evidence: f64,
+    /// What other poses of the part that are sure by themselves add to the log odds, see [`Self::among`].
+    pub company: f64,
 }
 
 /// So many points, or ends, are worth as much as what is believed without any.
@@ -55,11 +60,40 @@ const SHARP: [f64; TERMS] = [-2.77, -26.9, -4.31, -35.9, 2.01, 0.0, 0.66, 2.24, 
 /// several sides, so that a right pose is held by all of its faces, and has more ends that are seen past than a wrong one.
 const FUSED: [f64; TERMS] = [-14.7, -9.6, -4.6, -45.3, 4.1, 2.0, 0.0, 3.3, 1.46, 0.47];
 
-/// Up to the first a scan is sharp, and from the second on a close look tells no more than the clouds; in between it counts in
-/// proportion. Bins of the tuning half have 0.116 at most. Coarse real scans of parts that are not quite the model's shape have 0.158 and
-/// more: there a close look mistrusts every pose. (In ray-cast scans as coarse it is as sure as in sharp ones.)
-const BLUR: [f64; 2] = [0.12, BLURRED];
-pub(super) const BLURRED: f64 = 0.15;
+/// The same where a scan is coarse, but sharp at its edges, to searches in piles. There less is seen of a pose, and it is believed by itself
+/// only if much speaks for it; see [`company`].
+const COARSE: [f64; TERMS] = [-4.69, -30.1, -5.14, -29.2, 1.09, 1.32, 2.45, 0.0, 0.03, 0.26];
+
+/// Up to the first a scan is sharp, and from the second on it is coarse; in between weights are mixed in proportion. Bins of the tuning
+/// half have 0.09 at most, coarse real scans and piles 0.13 and more.
+const BLUR: [f64; 2] = [0.1, 0.13];
+
+/// Of a coarse scan whose edges are soft a close look tells nothing: up to the first they are, from the second on they are sharp, in between
+/// in proportion. Coarse real scans of the tuning half, of parts that are not quite the model's shape, in which a close look mistrusts every
+/// pose, have 0.22 and 0.37; ray-cast ones as coarse have 0.45 to 0.75.
+const EDGES: [f64; 2] = [0.38, 0.44];
+
+fn share(value: f64, [from, to]: [f64; 2]) -> f64 {
+    ((value - from) / (to - from)).clamp(0.0, 1.0)
+}
+
+/// Whether a close look at a scan of one camera tells nothing.
+pub(super) fn is_blurred(blur: f64, edges: Option<f64>) -> bool {
+    blur >= BLUR[1] && edges.is_none_or(|edges| edges <= EDGES[0])
+}
+
+/// What company is worth, and for how many at most. Of searches in piles of the tuning half it brings back the right poses that were lost to
+/// `COARSE`, which asks for more than weights that know of no company, and few wrong ones; in sharp scans, where each pose is seen well
+/// enough by itself, it brings as many wrong ones as right ones, and does not count.
+const COMPANY: f64 = 2.5;
+const MOST_COMPANY: f64 = 3.0;
+
+/// What is added to the log odds of a pose where others of the same part are found, each so sure by itself, from 0 to 1: the more, the
+/// likelier is another. Nothing where there is none: a part may lie alone.
+#[must_use]
+pub fn company(certainties: impl Iterator<Item = f64>) -> f64 {
+    COMPANY * certainties.fold(0.0, |sum, sure| sum + sure).min(MOST_COMPANY).ln_1p()
+}
 
 /// Of a loss the root: the step from none to a little tells most.
 fn held(loss: f64) -> f64 {
@@ -96,10 +130,34 @@ impl Measures {
     /// Logarithm of the odds that the pose is right.
     #[must_use]
     pub fn log_odds(&self) -> f64 {
+        self.log_odds_alone() + self.company
+    }
+
+    /// How sure the pose is by itself, from 0 at even odds to 1.
+    #[must_use]
+    pub fn certainty(&self) -> f64 {
+        (2.0 * probability(self.log_odds_alone()) - 1.0).max(0.0)
+    }
+
+    /// The same pose in such [`company`], which counts as far as the scan is coarse and has sharp edges.
+    #[must_use]
+    pub fn among(self, company: f64) -> Self {
+        let [_, coarse, _] = self.kinds();
+        Self { company: if self.is_fused { 0.0 } else { coarse * company }, ..self }
+    }
+
+    /// How much a scan of one camera is sharp, coarse with sharp edges, and blurred, in sum 1.
+    fn kinds(&self) -> [f64; 3] {
+        let blur = share(self.blur, BLUR);
+        let edges = self.edges.map_or(0.0, |edges| share(edges, EDGES));
+        [1.0 - blur, blur * edges, blur * (1.0 - edges)]
+    }
+
+    fn log_odds_alone(&self) -> f64 {
         let [contradicted, runs_on, beyond] = self.objections();
         let closeness = self.closeness.clamp(CLOSENESS[0], CLOSENESS[1]);
         let [_, second, third] = self.losses.map(held);
-        let sharp: [f64; TERMS] = [
+        let terms: [f64; TERMS] = [
             1.0,
             contradicted,
             runs_on,
@@ -111,19 +169,20 @@ impl Measures {
             f64::from(self.contour.ends).ln_1p(),
             self.evidence.ln_1p(),
         ];
-        let blurred = [1.0, self.evidence.ln_1p(), self.closeness];
-        // Of a fused scan the clouds alone tell nothing.
-        let blur = if self.is_fused { 0.0 } else { self.blur };
-        let blur = ((blur - BLUR[0]) / (BLUR[1] - BLUR[0])).clamp(0.0, 1.0);
         let weighed =
             |terms: &[f64], weights: &[f64]| -> f64 { terms.iter().zip(weights).map(|(a, b)| a * b).sum() };
-        (1.0 - blur) * weighed(&sharp, self.weights()) + blur * weighed(&blurred, &ONE_SIDED)
+        if self.is_fused {
+            return weighed(&terms, &FUSED);
+        }
+        let of_clouds = weighed(&[1.0, self.evidence.ln_1p(), self.closeness], &ONE_SIDED);
+        let [sharp, coarse, blurred] = self.kinds();
+        sharp * weighed(&terms, &SHARP) + coarse * weighed(&terms, &COARSE) + blurred * of_clouds
     }
 
     /// The probability that the pose is right.
     #[must_use]
     pub fn score(&self) -> f64 {
-        1.0 / (1.0 + (-self.log_odds()).exp())
+        probability(self.log_odds())
     }
 
     /// What speaks most against the pose.
@@ -141,6 +200,10 @@ impl Measures {
         ];
         all.into_iter().min_by(|(a, _), (b, _)| a.total_cmp(b)).map_or(Objection::Loose, |(_, worst)| worst)
     }
+}
+
+fn probability(log_odds: f64) -> f64 {
+    1.0 / (1.0 + (-log_odds).exp())
 }
 
 /// How well a right pose is held along a motion, about.

@@ -165,7 +165,10 @@ impl Discs {
 
     fn look(&self, disc: &Disc, place: &Point3<f64>, best: &mut (f64, usize)) {
         let Some(parts) = &disc.parts else {
-            for (at, (point, _)) in disc.run.clone().zip(&self.points[disc.run.clone()]) {
+            // Of points that coincide one stands for all.
+            let end = if disc.reach == 0.0 { disc.run.start + 1 } else { disc.run.end };
+            let run = disc.run.start..end;
+            for (at, (point, _)) in run.clone().zip(&self.points[run]) {
                 let dist_sq = (point - place).norm_squared();
                 if dist_sq < best.0 {
                     *best = (dist_sq, at);

@@ -33,6 +33,9 @@ const MOST_WIDENED: f32 = 2.0;
 const MOST_SHARED: usize = 1024;
 const SHARING_SAMPLE: usize = 256;
 
+/// So many points are looked at while a cell of a sparse grid is searched for.
+const POINTS_PER_SEARCH: usize = 128;
+
 /// Cells per axis of a sparse grid at most: then a number of 64 bits names each.
 const MAX_PER_SPARSE_AXIS: usize = 1 << 21;
 
@@ -199,10 +202,14 @@ impl Grid {
         start(first)..start(end)
     }
 
-    /// Whether so many columns are more than are worth looking at one by one.
+    /// Whether so many columns are more than are worth looking for one by one, of those that hold points.
     fn are_too_many(&self, low: [usize; 3], high: [usize; 3]) -> bool {
-        let columns = || (high[0] - low[0] + 1).saturating_mul(high[1] - low[1] + 1);
-        !self.is_dense() && columns() > self.occupied.len()
+        !self.is_dense() && columns(low, high) > self.occupied.len()
+    }
+
+    /// Whether all points are looked at in less time than so many columns are looked for.
+    fn are_slower_than_all(&self, low: [usize; 3], high: [usize; 3]) -> bool {
+        !self.is_dense() && columns(low, high) > self.order.len() / POINTS_PER_SEARCH
     }
 
     /// The points, by cell; within a cell in their own order.
@@ -220,7 +227,7 @@ impl Grid {
     /// Ranges of [`Self::order`], ascending, that hold every point within `radius` of `place`, and others.
     pub fn around(&self, place: [f32; 3], radius: f32) -> impl Iterator<Item = Range<usize>> + '_ {
         let (radius, low, high) = self.ball(place, radius);
-        let all = self.are_too_many(low, high).then_some(0..self.order.len());
+        let all = self.are_slower_than_all(low, high).then_some(0..self.order.len());
         let columns = if all.is_some() { 0..0 } else { low[0]..high[0] + 1 };
         let columns = columns.flat_map(move |x| {
             let dx = self.gap(0, x, place[0]);
@@ -234,7 +241,7 @@ impl Grid {
     #[allow(clippy::inline_always)] // the head of an inner loop
     pub(crate) fn each_around(&self, place: [f32; 3], radius: f32, mut look: impl FnMut(Range<usize>)) {
         let (radius, low, high) = self.ball(place, radius);
-        if self.are_too_many(low, high) {
+        if self.are_slower_than_all(low, high) {
             return look(0..self.order.len());
         }
         for x in low[0]..=high[0] {
@@ -370,6 +377,11 @@ impl Grid {
     fn index(&self, [x, y, z]: [usize; 3]) -> usize {
         (x * self.shape[1] + y) * self.shape[2] + z
     }
+}
+
+/// How many columns of cells there are from one cell to another.
+fn columns(low: [usize; 3], high: [usize; 3]) -> usize {
+    (high[0] - low[0] + 1).saturating_mul(high[1] - low[1] + 1)
 }
 
 /// The whole number nearest to `x` among those from 0 to `last`, below 2^23. A cast, which has to mind every float there

@@ -188,7 +188,11 @@ impl Nearby {
                                 break;
                             }
                             let has_all = farthest(q, &bounds) < 0.999 * radius;
-                            *sum = if has_all { total } else { self.sum_of_some(q, radius, &values) };
+                            *sum = if has_all {
+                                total
+                            } else {
+                                self.strided_sum(q, radius, MOST_SUMMED, |at| values[at])
+                            };
                             continue;
                         }
                         grid.each_around(
@@ -229,17 +233,29 @@ impl Nearby {
         num
     }
 
-    /// Of the points around a place every so many-th, each for so many.
-    fn sum_of_some(&self, place: [f32; 3], radius: f32, values: &[u32]) -> u32 {
+    /// About the sum of the `values`, one for each row, of [`Self::within`]: of more than `most` points in the cells around, every so many-th
+    /// stands for all.
+    pub(crate) fn sum_of_some(
+        &self,
+        query: &Point3<f64>,
+        distance: f64,
+        most: usize,
+        value: impl Fn(u32) -> u32,
+    ) -> u32 {
+        let order = self.all().grid.order();
+        self.strided_sum(self.local(query), self.radius(distance), most, |at| value(order[at]))
+    }
+
+    fn strided_sum(&self, place: [f32; 3], radius: f32, most: usize, value: impl Fn(usize) -> u32) -> u32 {
         let Sorted { grid, points, .. } = self.all();
-        let step = self.crowding(place, radius).div_ceil(MOST_SUMMED).max(1);
+        let step = self.crowding(place, radius).div_ceil(most).max(1);
         let (mut sum, mut skip) = (0_u32, 0);
         grid.each_around(place, radius, |run| {
             let mut at = run.start + skip;
             while at < run.end {
                 let d = [0, 1, 2].map(|axis| points[axis][at] - place[axis]);
                 let is_within = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] <= radius * radius;
-                sum = sum.saturating_add(if is_within { values[at] } else { 0 });
+                sum = sum.saturating_add(if is_within { value(at) } else { 0 });
                 at += step;
             }
             skip = at - run.end;
@@ -447,7 +463,10 @@ pub fn spacing(points: &[Point3<f64>]) -> f64 {
 }
 
 /// [`spacing`]; `None` once `interrupted` says so.
-pub(crate) fn spacing_until(points: &[Point3<f64>], interrupted: impl Fn() -> bool) -> Option<f64> {
+pub(crate) fn spacing_until(
+    points: &[Point3<f64>],
+    interrupted: impl Fn() -> bool + Sync + Send,
+) -> Option<f64> {
     let (all, size) = nearest_distances(points, &interrupted)?;
     // No cloud that hangs together has its points nearer than this: a curve is longer, a surface wider.
     let on_a_line = size / points.len() as f64;
@@ -541,7 +560,10 @@ fn mean(distances: &[f64]) -> f64 {
 
 /// What [`mean_spacing`] is the mean of, none for fewer than two points; and the diagonal of the box around the bulk of
 /// the points. `None` once `interrupted` says so.
-fn nearest_distances(points: &[Point3<f64>], interrupted: impl Fn() -> bool) -> Option<(Vec<f64>, f64)> {
+fn nearest_distances(
+    points: &[Point3<f64>],
+    interrupted: impl Fn() -> bool + Sync + Send,
+) -> Option<(Vec<f64>, f64)> {
     let n = points.len();
     if n < 2 {
         return Some((Vec::new(), 0.0));
@@ -559,15 +581,16 @@ fn nearest_distances(points: &[Point3<f64>], interrupted: impl Fn() -> bool) -> 
         Sorted::until(&rows, grid, &interrupted).filter(|_| !interrupted())
     };
     let coarse = sorted(widest / (n as f32 / POINTS_PER_CELL).cbrt())?;
-    let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE));
+    let mut guess = coarse.spacings(None, points, &coarse.strata(GUESS_SAMPLE), &interrupted)?;
     guess.sort_unstable_by(f64::total_cmp);
     // The median: a few far points must not make the cells of all others wide.
     let cell = CELL_PER_SPACING * (guess[guess.len() / 2] / unit) as f32;
-    let distances = if cell < 0.7 * coarse.grid.cell_size() {
+    // Where most points coincide with another one it is 0, and tells nothing.
+    let distances = if 0.0 < cell && cell < 0.7 * coarse.grid.cell_size() {
         let fine = sorted(cell)?;
-        fine.spacings(Some(&coarse), points, &fine.strata(SPACING_SAMPLE))
+        fine.spacings(Some(&coarse), points, &fine.strata(SPACING_SAMPLE), &interrupted)?
     } else {
-        coarse.spacings(None, points, &coarse.strata(SPACING_SAMPLE))
+        coarse.spacings(None, points, &coarse.strata(SPACING_SAMPLE), &interrupted)?
     };
     Some((distances, size))
 }
@@ -586,7 +609,7 @@ const GUESS_SAMPLE: usize = 64;
 const GATHER_GRAIN: usize = 1 << 16;
 
 /// Points that one thread asks at a time.
-const SPACING_GRAIN: usize = 1024;
+const SPACING_GRAIN: usize = 128;
 
 /// Columns in the order of a grid over them, with `LANES` points at infinity at the end.
 #[derive(Debug)]
@@ -650,11 +673,18 @@ impl Sorted {
     /// The distance, in the unit of `rows`, of each of the points at `positions` of the order to its nearest other point.
     /// `rows` are the points that the columns were made from, as they were given. A point whose cells hold no other is
     /// looked up in the `coarser` columns, if there are any.
-    fn spacings(&self, coarser: Option<&Self>, rows: &[Point3<f64>], positions: &[u32]) -> Vec<f64> {
+    fn spacings(
+        &self,
+        coarser: Option<&Self>,
+        rows: &[Point3<f64>],
+        positions: &[u32],
+        interrupted: &(impl Fn() -> bool + Sync + Send),
+    ) -> Option<Vec<f64>> {
         let chunks = par::chunks(positions.len(), SPACING_GRAIN, |run| {
-            dispatch(Spacings { sorted: self, coarser, rows, positions: &positions[run] })
+            let of = Spacings { sorted: self, coarser, rows, positions: &positions[run] };
+            (!interrupted()).then(|| dispatch(of))
         });
-        chunks.concat()
+        Some(chunks.into_iter().collect::<Option<Vec<_>>>()?.concat())
     }
 
     /// The row of the point nearest to that at `place`, which is itself `row`, if there is one in the cells around.

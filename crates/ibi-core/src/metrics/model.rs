@@ -9,6 +9,7 @@ use crate::pace::Pace;
 use crate::symmetries::{BOP_STEP, Symmetries, Turning};
 use nalgebra::{Isometry3, Point3};
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::sync::OnceLock;
 
 /// The points of a model, with what its errors need: a tree and the diameter, each made on first use.
@@ -144,13 +145,22 @@ impl Model {
         Ok(gaps_sq.into_iter().map(f64::sqrt).sum::<f64>() / self.points.len() as f64)
     }
 
+    /// Over each place once: where many points coincide, a question would look at all of them.
+    fn tree(&self) -> &Neighbors {
+        self.tree.get_or_init(|| {
+            let mut seen = HashSet::with_capacity(self.points.len());
+            let is_new = |p: &&Point3<f64>| seen.insert(p.coords.map(f64::to_bits));
+            Neighbors::new(&self.points.iter().filter(is_new).copied().collect::<Vec<_>>())
+        })
+    }
+
     /// Whether a kd-tree finds the nearest points of the moved ones faster: it does for those nearby, and is lost among points
     /// that are all about as far off. The answers are the same.
     fn are_near(&self, motion: &Isometry3<f64>) -> bool {
         if self.points.len() > MOST_OF_TREE {
             return false;
         }
-        let tree = self.tree.get_or_init(|| Neighbors::new(&self.points));
+        let tree = self.tree();
         let sample = || self.points.iter().step_by(self.points.len().div_ceil(SAMPLE));
         let gap = |p| tree.nearest(&(motion * p)).map_or(0.0, |(_, dist_sq)| dist_sq.sqrt());
         let first = self.points[0];
@@ -161,7 +171,7 @@ impl Model {
 
     /// How far each point is from the nearest one once it is moved, squared; less than all if interrupted.
     fn gaps_sq_by_tree(&self, motion: &Isometry3<f64>, interrupt: &Interrupt) -> Vec<f64> {
-        let tree = self.tree.get_or_init(|| Neighbors::new(&self.points));
+        let tree = self.tree();
         let parts = par::chunks(self.points.len(), GRAIN, |run| {
             let mut pace = Pace::new(interrupt);
             let points = self.points[run].iter().take_while(|_| !pace.is_over(QUERY));

@@ -11,8 +11,8 @@ use crate::stages::Hypothesis;
 #[derive(Debug, Default)]
 pub(crate) struct Contest {
     pub(super) candidates: Vec<Candidate>,
-    /// What passed, and failed when it was looked at closely: with each where it passed; what is told of is where that settled.
-    pub(super) rejected: Vec<(Isometry3<f64>, Rejected)>,
+    /// What passed, and failed when it was looked at closely.
+    pub(super) given_up: Vec<GivenUp>,
     pub(super) num_rounds: u32,
 }
 
@@ -26,6 +26,32 @@ pub(super) struct Candidate {
     pub(super) measured_at: u32,
     /// What a close look has found, if there was one.
     pub(super) proof: Option<Proof>,
+}
+
+/// A candidate that failed when it was looked at closely.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct GivenUp {
+    /// Where it passed validation.
+    pub(super) passed: Isometry3<f64>,
+    /// Where it settled.
+    pub(super) candidate: Candidate,
+    pub(super) proof: Proof,
+    /// Whether it was taken up again, since others of its kind were found.
+    pub(super) is_recalled: bool,
+}
+
+impl GivenUp {
+    /// What is told of it, among all that was found; nothing if it was taken up again.
+    pub(super) fn told(&self, company: f64) -> Option<Rejected> {
+        let measures = self.proof.among(company).measures;
+        (!self.is_recalled).then(|| Rejected {
+            target_from_source: self.candidate.hypothesis.target_from_source,
+            score: measures.score(),
+            objection: measures.objection(),
+            measures: Some(measures),
+            round: self.candidate.round,
+        })
+    }
 }
 
 impl Contest {

@@ -12,16 +12,27 @@ pub(super) struct Looked {
 }
 
 impl Stages<'_> {
-    /// The hypothesis settled and judged on all that was measured or, where there is no more than the clouds, validated on those.
-    pub(super) fn look_closely(&self, context: &Context<'_>, hypothesis: &Hypothesis) -> Looked {
+    /// The hypothesis settled and judged on all that was measured, and by the company it is in, or, where there is no more than the clouds,
+    /// validated on those.
+    pub(super) fn look_closely(
+        &self,
+        context: &Context<'_>,
+        hypothesis: &Hypothesis,
+        company: f64,
+    ) -> Looked {
         if self.looks_closely()
             && let Some(proof) = context.proof(&hypothesis.target_from_source)
-            && let Some(verdict) = self.hv.verdict_of_closeup(proof.measures.log_odds(), proof.explained)
+            && let proof = proof.among(company)
+            && let Some(verdict) = self.verdict_of(&proof)
         {
             let hypothesis = Hypothesis { target_from_source: proof.target_from_source, ..*hypothesis };
             return Looked { hypothesis, verdict, proof: Some(proof) };
         }
         Looked { hypothesis: *hypothesis, verdict: self.hv.validate(context, hypothesis), proof: None }
+    }
+
+    pub(super) fn verdict_of(&self, proof: &Proof) -> Option<Verdict> {
+        self.hv.verdict_of_closeup(proof.measures.log_odds(), proof.explained)
     }
 
     pub(super) fn looks_closely(&self) -> bool {

@@ -4,17 +4,16 @@ use std::time::Instant;
 
 use nalgebra::Isometry3;
 
-use super::candidates::Candidate;
+use super::candidates::{Candidate, Contest, GivenUp};
 use super::closely::Looked;
 use super::judge::Judged;
 use super::memory::Tried;
 use super::stages::Stages;
 use super::state::State;
-use crate::evidence::Proof;
 use crate::grace::Grace;
 use crate::interrupt::Phase;
-use crate::params::{Params, Removal};
-use crate::registration::Rejected;
+use crate::params::Removal;
+use crate::stages::Verdict;
 
 /// A close look is worth so many others: it tries some tens of poses.
 const PROOF_LOOKS: usize = 64;
@@ -35,7 +34,7 @@ impl State<'_> {
         let is_same = |other: &Isometry3<f64>| {
             scene.source.displacement(&candidate.hypothesis.target_from_source, other) < same
         };
-        if self.contest.rejected.iter().any(|(passed, _)| is_same(passed)) {
+        if self.contest.given_up.iter().any(|given_up| is_same(&given_up.passed)) {
             return;
         }
         let mut before = self.contest.candidates.iter_mut();
@@ -70,7 +69,7 @@ impl State<'_> {
             if !self.turn_best(stages, grace) {
                 break;
             }
-            let Some(value) = self.accept_best(stages.params, least) else { break };
+            let Some(value) = self.accept_best(stages, least) else { break };
             best_value = best_value.or(Some(value));
             num_accepted += 1;
         }
@@ -117,10 +116,11 @@ impl State<'_> {
         let new: Vec<Candidate> =
             self.contest.candidates.extract_if(.., |candidate| candidate.proof.is_none()).collect();
         let cost = PROOF_LOOKS * self.problem.cost_of_look();
+        let company = self.instances.company();
         let looked = grace.map(
             new.len(),
             |_| cost,
-            |i| stages.look_closely(&self.context(stages.params, new[i].round), &new[i].hypothesis),
+            |i| stages.look_closely(&self.context(stages.params, new[i].round), &new[i].hypothesis, company),
         );
         let mut is_complete = true;
         for (candidate, looked) in new.into_iter().zip(looked) {
@@ -140,15 +140,10 @@ impl State<'_> {
                 }
                 // Only a close look rejects here, and it tells why.
                 Some(Looked { hypothesis, proof, .. }) => {
-                    let rejected = proof.map(|Proof { measures, .. }| Rejected {
-                        target_from_source: hypothesis.target_from_source,
-                        score: measures.score(),
-                        objection: measures.objection(),
-                        measures: Some(measures),
-                        round: candidate.round,
-                    });
                     let passed = candidate.hypothesis.target_from_source;
-                    self.contest.rejected.extend(rejected.map(|rejected| (passed, rejected)));
+                    let candidate = Candidate { hypothesis, proof, ..candidate };
+                    let given_up = |proof| GivenUp { passed, candidate, proof, is_recalled: false };
+                    self.contest.given_up.extend(proof.map(given_up));
                 }
             }
         }
@@ -157,7 +152,8 @@ impl State<'_> {
 
     /// Makes an instance of the best candidate, the earlier of equals, if its value is at least `least`; returns
     /// the value.
-    pub(super) fn accept_best(&mut self, params: &Params, least: f64) -> Option<f64> {
+    pub(super) fn accept_best(&mut self, stages: &Stages<'_>, least: f64) -> Option<f64> {
+        let params = stages.params;
         let at = self.contest.best()?;
         if self.contest.candidates[at].value < least {
             return None;
@@ -174,6 +170,29 @@ impl State<'_> {
         self.ahead.forget();
         self.instances.push(hypothesis, round, proof);
         self.last_passed_at = self.num_rounds();
+        self.recall(stages);
         Some(value)
+    }
+
+    /// Makes candidates again of those that were given up and would not be in today's company.
+    fn recall(&mut self, stages: &Stages<'_>) {
+        if self.contest.given_up.is_empty() {
+            return;
+        }
+        let company = self.instances.company();
+        let Contest { given_up, candidates, .. } = &mut self.contest;
+        for given_up in given_up.iter_mut().filter(|given_up| !given_up.is_recalled) {
+            let proof = given_up.proof.among(company);
+            if let Some(verdict) = stages.verdict_of(&proof).filter(Verdict::accepted) {
+                given_up.is_recalled = true;
+                // Of all that was found since nothing is known: an instance may have claimed its points.
+                candidates.push(Candidate {
+                    value: verdict.value,
+                    measured_at: 0,
+                    proof: Some(proof),
+                    ..given_up.candidate
+                });
+            }
+        }
     }
 }

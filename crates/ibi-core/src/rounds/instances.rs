@@ -4,6 +4,7 @@ use std::sync::OnceLock;
 
 use nalgebra::Isometry3;
 
+use crate::evidence::odds::company;
 use crate::evidence::{Known, Proof};
 use crate::scene::Scene;
 use crate::stages::Hypothesis;
@@ -23,6 +24,11 @@ pub(crate) struct Instance {
 impl Instance {
     pub(crate) fn pose(&self) -> &Isometry3<f64> {
         &self.hypothesis.target_from_source
+    }
+
+    /// How sure it is by itself.
+    fn certainty(&self) -> f64 {
+        self.proof.map_or(0.0, |proof| proof.measures.certainty())
     }
 
     /// Share of the source that lies on the target; measured when first asked for.
@@ -61,6 +67,17 @@ impl Instances {
 
     pub(crate) fn poses(&self) -> &[Isometry3<f64>] {
         &self.poses
+    }
+
+    /// What they add to the odds of another pose.
+    pub(crate) fn company(&self) -> f64 {
+        company(self.all.iter().map(Instance::certainty))
+    }
+
+    /// The proof of one of them among the others.
+    pub(crate) fn proof_among_others(&self, at: usize) -> Option<Proof> {
+        let others = self.all.iter().enumerate().filter(|&(other, _)| other != at);
+        Some(self.all[at].proof?.among(company(others.map(|(_, other)| other.certainty()))))
     }
 
     /// Keeps those for which there is something, and returns what.

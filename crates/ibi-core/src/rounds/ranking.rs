@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 
 use nalgebra::Isometry3;
 
-use super::instances::Instance;
+use super::instances::Instances;
 use super::problem::Problem;
 use super::state::State;
 use crate::evidence::Support;
@@ -29,7 +29,7 @@ impl State<'_> {
             overlap + pairs.len() / 16 + 1
         };
         let measured = grace
-            .map(self.instances.len(), cost, |at| measure(&self.problem, &self.instances[at], &supports[at]));
+            .map(self.instances.len(), cost, |at| measure(&self.problem, &self.instances, at, &supports[at]));
         let mut measured: Vec<(Pose, Vec<f64>)> = measured.into_iter().flatten().collect();
         // Stable: equals stay in the order in which they were found.
         measured.sort_by(|(a, _), (b, _)| b.score.total_cmp(&a.score));
@@ -40,7 +40,9 @@ impl State<'_> {
             ControlFlow::Break(reason) if !stop_reason.is_from_outside() => reason,
             _ => stop_reason,
         };
-        let mut rejected: Vec<_> = self.contest.rejected.into_iter().map(|(_, rejected)| rejected).collect();
+        let company = self.instances.company();
+        let mut rejected: Vec<_> =
+            self.contest.given_up.iter().filter_map(|given_up| given_up.told(company)).collect();
         rejected.sort_by(|a, b| b.score.total_cmp(&a.score));
         rejected.truncate(MAX_REJECTED);
         Registration {
@@ -56,7 +58,8 @@ impl State<'_> {
 }
 
 /// A pose with its quality measures, and the squared residual of each of its inliers.
-fn measure(problem: &Problem<'_>, instance: &Instance, support: &Support) -> (Pose, Vec<f64>) {
+fn measure(problem: &Problem<'_>, instances: &Instances, at: usize, support: &Support) -> (Pose, Vec<f64>) {
+    let (instance, proof) = (&instances[at], instances.proof_among_others(at));
     let pose = *instance.pose();
     let (scene, pairs) = (&problem.scene, &problem.pairs);
     let t_he_pr = scene.tolerances.t_he_pr;
@@ -72,7 +75,7 @@ fn measure(problem: &Problem<'_>, instance: &Instance, support: &Support) -> (Po
     let mean_sq = residuals_sq.iter().sum::<f64>() / residuals_sq.len().max(1) as f64;
     let pose = Pose {
         target_from_source: pose,
-        score: instance.proof.map_or_else(|| support.score(), |proof| proof.measures.score()),
+        score: proof.map_or_else(|| support.score(), |proof| proof.measures.score()),
         overlap: instance.overlap(scene),
         closeness: support.closeness(),
         back_fit: support.back_fit,
@@ -80,7 +83,7 @@ fn measure(problem: &Problem<'_>, instance: &Instance, support: &Support) -> (Po
         inlier_rmse: mean_sq.sqrt(),
         inliers,
         round: instance.round,
-        measures: instance.proof.map(|proof| proof.measures),
+        measures: proof.map(|proof| proof.measures),
         centre: pose * scene.source.centre,
         covariance: instance.known.as_ref().map(|known| known.covariance),
         free_motions: instance.known.as_ref().map(|known| known.free_motions.clone()).unwrap_or_default(),

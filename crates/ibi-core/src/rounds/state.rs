@@ -286,7 +286,7 @@ impl<'a> State<'a> {
             && self.prove_candidates(stages, &mut grace)
             && self.turn_best(stages, &mut grace)
         {
-            self.accept_best(stages.params, f64::NEG_INFINITY);
+            self.accept_best(stages, f64::NEG_INFINITY);
         }
     }
 }

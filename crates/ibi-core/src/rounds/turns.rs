@@ -43,7 +43,7 @@ impl State<'_> {
             }
             let target_from_source = scene.icp(Detail::Look, pose);
             let turned = Hypothesis { target_from_source, ..hypothesis };
-            let looked = stages.look_closely(&context, &turned);
+            let looked = stages.look_closely(&context, &turned, self.instances.company());
             if looked.verdict.value > best_value {
                 best_value = looked.verdict.value;
                 best = Some(looked);

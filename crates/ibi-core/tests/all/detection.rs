@@ -488,6 +488,22 @@ fn only_a_region_is_looked_into() {
     assert_eq!(found.registration.poses[0].measures, cut.registration.poses[0].measures);
     assert_eq!(found.scan.unwrap().points, cut.scan.unwrap().points);
 
+    // Or as if the rest were there always.
+    let rest: Vec<_> = points.iter().copied().filter(|p| !roi.contains(p)).collect();
+    let with_nan = rest.iter().copied().chain([Point3::new(f64::NAN, 0.0, 0.0)]).collect();
+    let options = Detect { background: Some(with_nan), ..Detect::default() };
+    let found = parts[0].detect(&scan(), &options).unwrap();
+    assert_eq!((found.registration.poses.len(), num_right(&found, &parts[0], &truth[0][1..])), (1, 1));
+    let scan_of_it = found.scan.unwrap();
+    let far = |p: &Point3<f64>| rest.iter().map(|q| (p - q).norm()).fold(f64::INFINITY, f64::min);
+    assert!(scan_of_it.background.iter().all(|p| far(p) < 2.0 * scan_of_it.voxel));
+    assert!(scan_of_it.background.len() > scan_of_it.points.len());
+    let options = Detect { background: Some(points.clone()), ..Detect::default() };
+    let nothing = parts[0].detect(&scan(), &options).unwrap();
+    assert_eq!(nothing.doubts().cloned().collect::<Vec<_>>(), [Doubt::Nothing]);
+    let options = Detect { background: Some(Vec::new()), ..Detect::default() };
+    assert_eq!(parts[0].detect(&scan(), &options).unwrap_err(), DetectionError::NoBackground);
+
     let far = Some(Roi::between(middle + 50.0 * reach, middle + 51.0 * reach));
     let nothing = parts[0].detect(&scan(), &Detect { roi: far, ..Detect::default() }).unwrap();
     let doubts: Vec<_> = nothing.doubts().cloned().collect();

@@ -4,8 +4,8 @@ use std::f64::consts::{PI, TAU};
 
 use ibi_core::evidence::contour::{Contour, Overrun, Placed, Rim, Scan, contour, overrun, run_on};
 use ibi_core::evidence::explained::{Reach, Shape, explained};
-use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays, spacing_of_rays};
-use ibi_core::evidence::odds::Measures;
+use ibi_core::evidence::noise::{noise_of_cloud, noise_of_rays, sharpness_of_edges, spacing_of_rays};
+use ibi_core::evidence::odds::{Measures, company};
 use ibi_core::evidence::rays::{MAX_ANGLE, MIN_FACING_COS, Rays, visible};
 use ibi_core::evidence::seen::{Look, Seen, Tally, Tolerance, look, merge, sight};
 use ibi_core::evidence::settle::{Steps, settle};
@@ -699,9 +699,11 @@ fn what_speaks_for_a_pose_raises_its_odds() {
         losses: [0.1, 0.2, 0.3],
         noise: 0.05,
         blur: 0.02,
+        edges: None,
         is_fused: false,
         closeness: 0.9,
         evidence: 3.0,
+        company: 0.0,
     };
     let bad = [
         Measures { tally: Tally { contradicted: 80, ..good.tally }, ..good },
@@ -712,6 +714,8 @@ fn what_speaks_for_a_pose_raises_its_odds() {
     ];
     for worse in bad {
         assert!(worse.log_odds() < good.log_odds(), "{worse:?}");
+        let [worse_still, coarse] = [worse, good].map(coarse);
+        assert!(worse_still.log_odds() < coarse.log_odds(), "coarse {worse:?}");
         // How close the thinned clouds lie told nothing more in fused scans.
         let [worse, good] = [worse, good].map(|one| Measures { is_fused: true, ..one });
         assert!(worse.log_odds() < good.log_odds() || worse.closeness < good.closeness, "fused {worse:?}");
@@ -724,6 +728,46 @@ fn what_speaks_for_a_pose_raises_its_odds() {
     assert_eq!(Measures::default().objections(), [0.0; 3]);
     let more = Measures { contour: Contour { unknown: 99, ..good.contour }, ..good };
     assert_eq!(more.log_odds(), good.log_odds());
+}
+
+/// As if the scan were coarse, with sharp edges.
+fn coarse(of: Measures) -> Measures {
+    Measures { blur: 0.5, edges: Some(0.7), ..of }
+}
+
+#[test]
+fn sure_poses_speak_for_others_in_coarse_scans() {
+    assert_eq!(company([].into_iter()), 0.0);
+    let of = |num: usize, each: f64| company(vec![each; num].into_iter());
+    assert!(0.0 < of(1, 0.5) && of(1, 0.5) < of(1, 1.0) && of(1, 1.0) < of(2, 1.0));
+    assert_eq!(of(9, 1.0), of(99, 1.0));
+
+    let poor = Measures {
+        tally: Tally { supported: 30, contradicted: 30, ..Tally::default() },
+        ..Measures::default()
+    };
+    let good = Measures {
+        tally: Tally { supported: 300, ..Tally::default() },
+        contour: Contour { ends: 90, ..Contour::default() },
+        losses: [0.5, 0.8, 0.9],
+        closeness: 1.0,
+        ..Measures::default()
+    };
+    let [poor, good] = [poor, good].map(coarse);
+    assert_eq!(poor.certainty(), 0.0);
+    assert!(good.certainty() > 0.5, "{}", good.certainty());
+    let among = good.among(1.5);
+    assert_eq!(among.log_odds(), good.log_odds() + 1.5);
+    assert_eq!(among.certainty(), good.certainty(), "company does not feed on itself");
+    assert_eq!(among.among(0.0), good);
+    for other in [
+        Measures { blur: 0.05, ..good },
+        Measures { edges: Some(0.2), ..good },
+        Measures { edges: None, ..good },
+        Measures { is_fused: true, ..good },
+    ] {
+        assert_eq!(other.among(1.5), other, "{other:?}");
+    }
 }
 
 // ------------------------------------------------------------------------------------------------ noise
@@ -770,6 +814,37 @@ fn points_are_as_far_apart_as_pixels_that_measured_something() {
     is(spacing(|at| at % 2 == 0), 0.024 * 2_f64.sqrt());
     let rays = Rays::new(Point3::origin(), &image(0.008, 0.25, |_, _| Some(3.0))).unwrap();
     assert_eq!(spacing_of_rays(&rays, &[], 0.2), f64::INFINITY);
+}
+
+/// A wall, and a step of 8 voxels before its right half that is as wide as `ramp` pixels.
+fn stepped(ramp: f64) -> Vec<Point3<f64>> {
+    image(PIXEL, 0.25, |x, _| Some(3.0 - 0.4 * ((x / PIXEL + 0.5) / ramp + 0.5).clamp(0.0, 1.0)))
+}
+
+const PIXEL: f64 = 0.008;
+
+fn sharpness(scan: &[Point3<f64>], points: &[Point3<f64>]) -> Option<f64> {
+    const VOXEL: f64 = 0.05;
+    let rays = Rays::new(Point3::origin(), scan).unwrap();
+    sharpness_of_edges(&rays, points, &Nearby::new(points, VOXEL), VOXEL)
+}
+
+#[test]
+fn edges_are_as_sharp_as_a_step_is_narrow() {
+    let [narrow, wide] = [1e-3, 6.0].map(stepped).map(|scan| sharpness(&scan, &scan).unwrap());
+    assert!(narrow > 0.9 && wide < 0.35, "{narrow}, {wide}");
+    // A flat wall has none.
+    let wall = image(PIXEL, 0.25, |_, _| Some(3.0));
+    assert_eq!(sharpness(&wall, &wall), None);
+}
+
+#[test]
+fn what_parts_lie_on_does_not_make_their_edges_sharp() {
+    let parts = stepped(6.0);
+    let beyond = image(PIXEL, 0.5, |x, y| (x.abs().max(y.abs()) > 0.25).then_some(6.0));
+    let together: Vec<_> = parts.iter().chain(&beyond).copied().collect();
+    let [alone, whole] = [&parts, &together].map(|points| sharpness(&together, points).unwrap());
+    assert!(alone < 0.45 && whole > alone, "{alone}, {whole}");
 }
 
 fn is_tie_at_12(cloud: &[Point3<f64>], point: &Point3<f64>) -> bool {
