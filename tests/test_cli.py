@@ -638,6 +638,7 @@ def test_a_full_disk_is_one_line(output, tmp_path):
     assert len(ran.stderr.splitlines()) == 1
     assert ran.stderr.startswith("ibi: ")
     assert "No space left on device" in ran.stderr
+    assert ("/dev/full" in ran.stderr) == (output is not None)
 
 
 def test_a_recording_is_written(tmp_path):

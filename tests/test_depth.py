@@ -194,6 +194,8 @@ def test_parts_are_found_without_planes(tmp_path):
     [
         (("--depth-scale", 1000), "--depth-scale is of a depth image; give its --camera"),
         (("--camera", "1,2,3"), "--camera 1,2,3: must be four numbers"),
+        (("--camera", "600,-600,3,4"), "--camera 600,-600,3,4: must be finite, FX and FY above 0"),
+        (("--camera", "600,600,nan,4"), "must be finite, FX and FY above 0"),
         (("--camera", NUMBERS, "--depth-scale", 0), "--depth-scale is 0; it must be above 0"),
         (("--camera", NUMBERS, "--viewpoint", "0,0,0"), "--camera says where it stood"),
         (("--remove-planes", 2, "--keep-plane"), "give --remove-planes or --remove-plane, not both"),

@@ -161,6 +161,7 @@ SCAN = np.random.default_rng(0).normal(size=(500, 3))
         (lambda: ibi.Model.from_mesh(SimpleNamespace(vertices=SCAN, faces=[])), "faces: the mesh has none"),
         (lambda: ibi.Model.from_mesh(SCAN, [[0, 1, 500]]), "faces"),
         (lambda: ibi.Model.from_mesh(*box(np.ones(3)), voxel=0), "voxel"),
+        (lambda: ibi.Model.from_mesh(*box(np.ones(3)), voxel=1e-9), "voxel: at 1e-09 about [0-9]+ points"),
         (lambda: ibi.Model(SCAN).detect(SCAN, viewpoint=CAMERA), "src_normals: detection needs them"),
         (lambda: MODEL.detect(SCAN), "viewpoint: give it"),
         (lambda: MODEL.detect(SCAN * 1000, viewpoint=CAMERA), "same unit"),

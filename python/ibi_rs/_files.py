@@ -25,7 +25,11 @@ def written(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     path = Path(path)
     if path.exists() and not path.is_file():  # /dev/stdout, a pipe: nothing to take the place of
-        yield path
+        try:
+            yield path
+        except OSError as error:
+            error.filename = error.filename or str(path)
+            raise
         return
     target = Path(os.path.realpath(path))  # a link stays one
     part = _part(target)

@@ -291,6 +291,8 @@ class Search:
             return None
         if len(numbers) != 4:
             misused(f"--camera {self.camera}: must be four numbers, FX,FY,CX,CY, or a file")
+        if not (np.isfinite(numbers).all() and min(numbers[:2]) > 0):
+            misused(f"--camera {self.camera}: must be finite, FX and FY above 0")
         return numbers
 
     def read(self, path: Path) -> io.Scan:

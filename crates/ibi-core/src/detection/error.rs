@@ -62,6 +62,19 @@ pub enum DetectionError {
     /// A box that is nowhere.
     #[error("roi: its place must be finite")]
     RoiPlace,
+    /// A voxel that would take more points than fit into memory.
+    #[error(
+        "voxel: at {} about {count} points of the mesh would be drawn; at most {most} are; give a larger one",
+        general(*voxel, 3)
+    )]
+    VoxelTooFine {
+        /// As it was given, or as it follows from the size of the mesh.
+        voxel: f64,
+        /// So many, or more.
+        count: usize,
+        /// What is allowed.
+        most: usize,
+    },
     /// A background without a point.
     #[error("background: it holds no point")]
     NoBackground,

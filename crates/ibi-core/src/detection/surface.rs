@@ -88,7 +88,13 @@ impl Surface {
             let allowed = "above 0 and finite";
             return Err(FeatureError::Setting { argument: "voxel", value: voxel, allowed }.into());
         }
-        let sampled = sample_mesh(mesh, Amount::Spacing(voxel / SAMPLES_PER_VOXEL), 0, interrupt)?;
+        let sampled = sample_mesh(mesh, Amount::Spacing(voxel / SAMPLES_PER_VOXEL), 0, interrupt);
+        let sampled = sampled.map_err(|error| match error {
+            FeatureError::TooManySamples { count, most } => {
+                DetectionError::VoxelTooFine { voxel, count, most }
+            }
+            error => error.into(),
+        })?;
         let (points, mut normals) = (sampled.points, sampled.normals);
         let mut is_seen = outer_surface(&points, &normals, mesh, &Views::default(), interrupt)?;
         for row in turned(&points, &normals, &is_seen, mesh, interrupt)? {
