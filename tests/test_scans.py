@@ -222,7 +222,7 @@ def test_what_lies_in_the_empty_bin_is_not_searched(pile, part, is_grid):
 
 def test_an_empty_bin_is_empty(part):
     empty = small_pile(VERTICES, FACES, num_parts=2, seed=SEED)
-    again = small_pile(VERTICES, FACES, num_parts=2, seed=SEED).points + RNG.normal(0, 0.1, empty.points.shape)
+    again = empty.points + RNG.normal(0, 0.1, empty.points.shape)
     found = part.detect(again, viewpoint=EYE, background=empty.points)
     assert len(found) == 0
     assert len(part.detect(again, viewpoint=EYE)) == 2
