@@ -50,7 +50,7 @@ class Measures:
     closeness, evidence : float
         As of a :class:`Pose`, among the points that no other pose owned then.
     company : float
-        What other poses of the part that are sure by themselves add to the log odds: in coarse scans.
+        What other poses of the part that are sure by themselves add to the log odds.
     """
 
     supported: int

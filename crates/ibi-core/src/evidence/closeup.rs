@@ -45,6 +45,11 @@ impl Proof {
     pub(crate) fn among(self, company: f64) -> Self {
         Self { measures: self.measures.among(company), ..self }
     }
+
+    /// The same of a pose that was found.
+    pub(crate) fn found_among(self, company: f64) -> Self {
+        Self { measures: self.measures.found_among(company), ..self }
+    }
 }
 
 /// Across a part: a detail is as wide as a voxel is, as a rule.

@@ -82,17 +82,19 @@ pub(super) fn is_blurred(blur: f64, edges: Option<f64>) -> bool {
     blur >= BLUR[1] && edges.is_none_or(|edges| edges <= EDGES[0])
 }
 
-/// What company is worth, and for how many at most. Of searches in piles of the tuning half it brings back the right poses that were lost to
-/// `COARSE`, which asks for more than weights that know of no company, and few wrong ones; in sharp scans, where each pose is seen well
-/// enough by itself, it brings as many wrong ones as right ones, and does not count.
+/// What company is worth in a coarse scan, and in a sharp one, and for how many at most. Of searches in piles of the tuning half it brings
+/// back the right poses that were lost to `COARSE`, which asks for more than weights that know of no company, and few wrong ones. In sharp
+/// scans each pose is seen well enough to be decided on by itself; that it is found among others makes it more sure, by as much as bins of
+/// the tuning half have shown.
 const COMPANY: f64 = 2.5;
+const COMPANY_OF_FOUND: f64 = 1.0;
 const MOST_COMPANY: f64 = 3.0;
 
-/// What is added to the log odds of a pose where others of the same part are found, each so sure by itself, from 0 to 1: the more, the
-/// likelier is another. Nothing where there is none: a part may lie alone.
+/// What it is that others of the same part are found, each so sure by itself, from 0 to 1: the more, the likelier is another. Nothing
+/// where there is none: a part may lie alone.
 #[must_use]
 pub fn company(certainties: impl Iterator<Item = f64>) -> f64 {
-    COMPANY * certainties.fold(0.0, |sum, sure| sum + sure).min(MOST_COMPANY).ln_1p()
+    certainties.fold(0.0, |sum, sure| sum + sure).min(MOST_COMPANY).ln_1p()
 }
 
 /// Of a loss the root: the step from none to a little tells most.
@@ -139,11 +141,23 @@ impl Measures {
         (2.0 * probability(self.log_odds_alone()) - 1.0).max(0.0)
     }
 
-    /// The same pose in such [`company`], which counts as far as the scan is coarse and has sharp edges.
+    /// The same pose in such [`company`], as it is decided on: that counts as far as the scan is coarse and has sharp edges.
     #[must_use]
     pub fn among(self, company: f64) -> Self {
         let [_, coarse, _] = self.kinds();
-        Self { company: if self.is_fused { 0.0 } else { coarse * company }, ..self }
+        self.with_company(COMPANY * coarse * company)
+    }
+
+    /// The same of a pose that was found: in sharp scans, too, it is more sure.
+    #[must_use]
+    pub fn found_among(self, company: f64) -> Self {
+        let [sharp, coarse, _] = self.kinds();
+        self.with_company((COMPANY * coarse + COMPANY_OF_FOUND * sharp) * company)
+    }
+
+    /// In scans that were fused from many views each pose is seen well enough.
+    fn with_company(self, company: f64) -> Self {
+        Self { company: if self.is_fused { 0.0 } else { company }, ..self }
     }
 
     /// How much a scan of one camera is sharp, coarse with sharp edges, and blurred, in sum 1.

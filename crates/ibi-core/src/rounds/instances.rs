@@ -77,7 +77,7 @@ impl Instances {
     /// The proof of one of them among the others.
     pub(crate) fn proof_among_others(&self, at: usize) -> Option<Proof> {
         let others = self.all.iter().enumerate().filter(|&(other, _)| other != at);
-        Some(self.all[at].proof?.among(company(others.map(|(_, other)| other.certainty()))))
+        Some(self.all[at].proof?.found_among(company(others.map(|(_, other)| other.certainty()))))
     }
 
     /// Keeps those for which there is something, and returns what.

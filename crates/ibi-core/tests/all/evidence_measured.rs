@@ -756,17 +756,20 @@ fn sure_poses_speak_for_others_in_coarse_scans() {
     let [poor, good] = [poor, good].map(coarse);
     assert_eq!(poor.certainty(), 0.0);
     assert!(good.certainty() > 0.5, "{}", good.certainty());
-    let among = good.among(1.5);
-    assert_eq!(among.log_odds(), good.log_odds() + 1.5);
+    let among = good.among(0.5);
+    assert!(among.log_odds() > good.log_odds() && among == good.found_among(0.5));
     assert_eq!(among.certainty(), good.certainty(), "company does not feed on itself");
     assert_eq!(among.among(0.0), good);
+    let sharp = Measures { blur: 0.05, ..good };
     for other in [
-        Measures { blur: 0.05, ..good },
+        sharp,
         Measures { edges: Some(0.2), ..good },
         Measures { edges: None, ..good },
         Measures { is_fused: true, ..good },
     ] {
-        assert_eq!(other.among(1.5), other, "{other:?}");
+        assert_eq!(other.among(0.5), other, "{other:?}");
+        // What was decided on by itself is more sure among others all the same, where it is seen well.
+        assert_eq!(other.found_among(0.5).log_odds() > other.log_odds(), other == sharp, "{other:?}");
     }
 }
 
